@@ -1,0 +1,41 @@
+"""The exceptions of lmdsl: every message says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class LmdslError(Exception):
+    """Base of every error that lmdsl raises on purpose."""
+
+
+class BadInput(LmdslError, ValueError):
+    """What the user wrote cannot be used (exit status 2 on the command line).
+
+    Parameters
+    ----------
+    message
+        One line that names the fault and the fix.
+    where
+        The path of the field at fault, such as ``state_box.x.cells``; empty when
+        the fault has no field.
+    """
+
+    def __init__(self, message: str, where: str = "") -> None:
+        self.where = where
+        self.message = message
+        super().__init__(f"{where}: {message}" if where else message)
+
+
+class MissingDependency(BadInput):
+    """An optional package is needed and not installed."""
+
+
+def shown(value: object, limit: int = 60) -> str:
+    """Return a short, printable, terminal-safe form of a value for a message."""
+    if isinstance(value, int) and not isinstance(value, bool) and value.bit_length() > 256:
+        return f"an integer of about {int(value.bit_length() * 0.30103) + 1} digits"
+    if isinstance(value, dict | list | tuple) and len(value) > 8:
+        return f"a {type(value).__name__} of {len(value)} items"
+    if isinstance(value, str) and len(value) > limit:
+        value = value[:limit] + "..."
+    text = ascii(value)
+    return text if len(text) <= 2 * limit else text[: 2 * limit] + "..."
