@@ -1,0 +1,211 @@
+"""Inequalities that survive rounding: each yes holds in exact arithmetic.
+
+All quantities are nonnegative, so a sum of L products has a relative rounding error of at most
+(L + 1) u, u = 2^-53, whatever its order; with gamma, the cost and the correction itself counted,
+(L + 8) u with a factor 1.1 to spare bounds everything (products that underflow add L * 2^-1074,
+covered by ``TINY``). A row that the fast bound leaves open is decided with exact rationals: the
+doubles G, gamma, V are read as they stand and a transition is numerator / total.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lmdsl.bellman import padded
+from lmdsl.lp import StabilizationLP
+
+Floats = NDArray[np.float64]
+Pairs = NDArray[np.int64]
+
+UNIT = 1.1 * 2.0**-53
+TINY = 1e-300
+MAX_EXACT = 20_000
+"""Rows decided with exact rationals before giving up: about 0.4 s."""
+
+
+def expected_above(lp: StabilizationLP, pair: Pairs, x: Floats, gamma: float) -> Floats:
+    """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
+    upper = np.empty(lp.n)
+    rows = lp.rows
+    _above(
+        pair, rows.pointer, rows.target, rows.code, rows.shares.value, gamma, padded(x), upper
+    )
+    return upper
+
+
+def add_above(a: Floats, b: Floats) -> Floats:
+    """Return an upper bound of a + b for nonnegative a, b; exact where one is 0."""
+    total = a + b
+    return np.where((a == 0) | (b == 0), total, total * (1 + 4 * UNIT))
+
+
+def backup_below(
+    lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None
+) -> Floats:
+    """Return a lower bound of min_a gamma P_a x + G_a, shape (n,); ``cost`` None means 0."""
+    lower, rows = np.empty(lp.n), lp.rows
+    _below(
+        lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value, gamma,
+        np.empty(0) if cost is None else cost, padded(x), lower,
+    )  # fmt: skip
+    return lower
+
+
+def holds_for_all(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> bool:
+    """Decide x <= gamma P_a x + G_a for every pair; False also where it cannot be decided."""
+    open_pairs = undecided(lp, x, gamma, cost)
+    if open_pairs is None:
+        return False
+    return all(exactly_below(lp, int(k), x, gamma, cost) for k in open_pairs)
+
+
+def undecided(
+    lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None
+) -> Pairs | None:
+    """Return the pairs for which x <= gamma P_a x + G_a is not clear; None if too many."""
+    found, rows = np.empty(MAX_EXACT, dtype=np.int64), lp.rows
+    count = _open(
+        lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value, gamma,
+        np.empty(0) if cost is None else cost, padded(x), found,
+    )  # fmt: skip
+    return None if count > MAX_EXACT else found[:count]
+
+
+def exact_backup(
+    lp: StabilizationLP, k: int, x: Floats, gamma: float, cost: Floats | None
+) -> Fraction:
+    """Return gamma P_a x + G_a of one pair exactly."""
+    n = lp.n
+    total = sum(
+        (Fraction(float(x[j])) * share for j, share in lp.rows.exact(k) if j < n), Fraction(0)
+    )
+    fixed = Fraction(0) if cost is None else Fraction(float(cost[k]))
+    return Fraction(gamma) * total / lp.rows.shares.total + fixed
+
+
+def exactly_below(
+    lp: StabilizationLP, k: int, x: Floats, gamma: float, cost: Floats | None
+) -> bool:
+    """Decide x <= gamma P_a x + G_a of one pair in exact arithmetic."""
+    return Fraction(float(x[lp.cell[k]])) <= exact_backup(lp, k, x, gamma, cost)
+
+
+def lower_until_below(
+    lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None, sweeps: int = 60
+) -> Floats | None:
+    """Lower x until x <= gamma P_a x + G_a holds for every pair; None where it does not settle.
+
+    Only components that break the inequality move, each to a rounded-down right-hand side. The
+    right-hand side is monotone in x, so nothing that holds is broken by more than it is lowered.
+    """
+    x = x.copy()
+    for _ in range(sweeps):
+        open_pairs = undecided(lp, x, gamma, cost)
+        if open_pairs is None:
+            x = np.minimum(x, backup_below(lp, x, gamma, cost))
+            continue
+        lowered = False
+        for k in open_pairs:
+            i = int(lp.cell[k])
+            bound = exact_backup(lp, int(k), x, gamma, cost)
+            if Fraction(float(x[i])) > bound:
+                x[i] = _rounded_down(bound)
+                lowered = True
+        if not lowered:
+            return x
+    return None
+
+
+def raise_from_zero(lp: StabilizationLP, gamma: float, cost: Floats, sweeps: int) -> Floats:
+    """Return value iterates from 0, rounded down: x <= T x holds along the whole way.
+
+    x_{k+1} = max(x_k, rounded-down T x_k) <= T x_k <= T x_{k+1}, as T is monotone.
+    """
+    x = np.zeros(lp.n)
+    for _ in range(sweeps):
+        y = np.maximum(x, backup_below(lp, x, gamma, cost))
+        if np.all(y - x <= 1e-12 * y):
+            return y
+        x = y
+    return x
+
+
+def _rounded_down(value: Fraction) -> float:
+    near = float(value)
+    return near if Fraction(near) <= value else float(np.nextafter(near, -np.inf))
+
+
+@njit(cache=True, nogil=True)
+def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def]
+    """The sum (P V)_k, and whether any term is not zero."""
+    q, something = 0.0, False
+    for e in range(pointer[k], pointer[k + 1]):
+        v = V[target[e]]
+        if v != 0.0:
+            something = True
+            q += share[code[e]] * v
+    return q, something
+
+
+@njit(cache=True, nogil=True)
+def _bound_below(k, pointer, target, code, share, gamma, cost, V):  # type: ignore[no-untyped-def]
+    q, something = _product(k, pointer, target, code, share, V)
+    g = cost[k] if len(cost) else 0.0
+    if not something:
+        return g
+    slack = (pointer[k + 1] - pointer[k] + 8) * UNIT
+    return max((gamma * q + g) * (1.0 - slack) - TINY, g)
+
+
+@njit(cache=True, nogil=True)
+def _above(pair, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
+    for i in range(len(pair)):
+        k = pair[i]
+        q, something = _product(k, pointer, target, code, share, V)
+        slack = (pointer[k + 1] - pointer[k] + 8) * UNIT
+        upper[i] = gamma * q * (1.0 + slack) + TINY if something else 0.0
+
+
+@njit(cache=True, nogil=True)
+def _below(pair_pointer, pointer, target, code, share, gamma, cost, V, lower):  # type: ignore[no-untyped-def]
+    for i in range(len(pair_pointer) - 1):
+        best = np.inf
+        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+            q = _bound_below(k, pointer, target, code, share, gamma, cost, V)
+            if q < best:
+                best = q
+        lower[i] = best
+
+
+@njit(cache=True, nogil=True)
+def _open(pair_pointer, pointer, target, code, share, gamma, cost, V, found):  # type: ignore[no-untyped-def]
+    count = 0
+    for i in range(len(pair_pointer) - 1):
+        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+            if V[i] > _bound_below(k, pointer, target, code, share, gamma, cost, V):
+                if count < len(found):
+                    found[count] = k
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def worst_excess(pair_pointer, pointer, target, code, share, gamma, cost, V):  # type: ignore[no-untyped-def]
+    """Return max r_a / G_a over pairs with G_a > 0, and whether r_a > 0 where G_a = 0.
+
+    r_a = max(0, V - lower bound of gamma P_a V - G_a), rounded up.
+    """
+    worst, stuck = 0.0, False
+    for i in range(len(pair_pointer) - 1):
+        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+            excess = V[i] - _bound_below(k, pointer, target, code, share, gamma, cost, V)
+            if excess > 0.0:
+                if cost[k] > 0.0:
+                    worst = max(worst, excess / cost[k] * (1.0 + 4.0 * UNIT))
+                else:
+                    stuck = True
+    return worst, stuck

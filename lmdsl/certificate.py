@@ -1,0 +1,367 @@
+"""The certificate: what "verified" means, computed from the finite model and the policy alone.
+
+With u the policy, P_u, G_u its rows, g = max(gamma, 1), five claims, each an inequality between
+stored doubles that holds in exact arithmetic (see bounds.py):
+
+1. stabilizing   w > 0, w >= g P_u w + d with d > 0. Then rho(g P_u) <= 1 - min d/w < 1: from every
+                 cell of C the chain reaches A almost surely, with geometric decay.
+2. upper bound   V_up >= gamma P_u V_up + G_u, V_up >= 0: the policy costs at most m'V_up.
+3. lower bound   W <= gamma P_a W + G_a for every surviving pair: no policy that stays in C u A and
+                 has finite weighted occupation costs less than m'W.
+4. measure       mu >= 0, ||m - mu + gamma P_u'mu||_1 <= 1e-9: the Lyapunov measure.
+5. gap           m'(V_up - W) / m'V_up.
+6. refusal       w >= 0, w != 0, w <= gamma P_a w for every surviving pair: the cells with w > 0
+                 have no policy of finite occupation at this gamma.
+
+A solver's status plays no part. A claim that almost holds is repaired or refused, never rounded.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl import bounds, linear, policy
+from lmdsl.bellman import padded
+from lmdsl.lp import StabilizationLP
+
+Floats = NDArray[np.float64]
+Pairs = NDArray[np.int64]
+
+MEASURE_TOLERANCE = 1e-9
+CLAIMS = ("stabilizing", "upper_bound", "lower_bound", "measure")
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Proved facts about a policy.
+
+    Attributes
+    ----------
+    stabilizing, upper_bound, lower_bound, measure
+        Which claims hold.
+    refusal
+        True when it is proved that no policy is stabilizing at this gamma.
+    contraction
+        Proved bound on rho(g P_u), None where claim 1 does not hold.
+    cost, lower, gap
+        m'V_up, m'W and the gap; None where not established.
+    measure_residual
+        ||m - mu + gamma P_u'mu||_1, rounded up; None where there is no mu.
+    tolerance
+        The gap asked for.
+    reasons
+        Why it is not verified, one sentence each; empty when verified.
+    """
+
+    stabilizing: bool
+    upper_bound: bool
+    lower_bound: bool
+    measure: bool
+    refusal: bool
+    contraction: float | None
+    cost: float | None
+    lower: float | None
+    gap: float | None
+    measure_residual: float | None
+    tolerance: float
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def verified(self) -> bool:
+        """Claims 1 to 4 hold and the gap is within the tolerance."""
+        claims = all(getattr(self, name) for name in CLAIMS)
+        return claims and self.gap is not None and self.gap <= self.tolerance
+
+
+@dataclass(frozen=True)
+class Witness:
+    """The vectors behind a certificate, on C, shape (n,) each.
+
+    Attributes
+    ----------
+    pair
+        The policy: a column per cell; None where nothing is claimed of one.
+    w
+        Vector of claim 1, or of the refusal; None where there is none.
+    V_up, W, mu
+        Vectors of claims 2 to 4; None where not established (W then counts as 0).
+    """
+
+    pair: Pairs | None
+    w: Floats | None = None
+    V_up: Floats | None = None
+    W: Floats | None = None
+    mu: Floats | None = None
+
+
+@dataclass(frozen=True)
+class Verified:
+    """A certificate with its witness."""
+
+    certificate: Certificate
+    witness: Witness = field(repr=False)
+
+
+# The checks: from vectors to yes or no ------------------------------------------------------
+
+
+def check_stabilizing(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
+    """Claim 1: return the proved contraction 1 - min d/w < 1, None where it does not hold."""
+    d = decrease(lp, pair, w)
+    if d is None or not len(w):
+        return None
+    share = float((d / w).min()) * (1 - 4 * bounds.UNIT)
+    contraction = float(np.nextafter(1 - share, 2.0))
+    return max(contraction, 0.0) if contraction < 1 else None
+
+
+def decrease(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
+    """Return d > 0 with w >= g P_u w + d, rounded down; None where there is none."""
+    if not (np.isfinite(w).all() and (w > 0).all()):
+        return None
+    d = w - bounds.expected_above(lp, pair, w, lp.growth)
+    d = d * (1 - 4 * bounds.UNIT)
+    return d if (d > 0).all() else None
+
+
+def check_upper(lp: StabilizationLP, pair: Pairs, V_up: Floats) -> bool:
+    """Claim 2: V_up >= gamma P_u V_up + G_u and V_up >= 0."""
+    if not (np.isfinite(V_up).all() and (V_up >= 0).all()):
+        return False
+    future = bounds.expected_above(lp, pair, V_up, lp.gamma)
+    return bool((V_up >= bounds.add_above(future, lp.cost[pair])).all())
+
+
+def check_lower(lp: StabilizationLP, W: Floats) -> bool:
+    """Claim 3: W <= gamma P_a W + G_a for every surviving pair."""
+    if not (np.isfinite(W).all() and (W >= 0).all()):
+        return False
+    return bounds.holds_for_all(lp, W, lp.gamma, lp.cost)
+
+
+def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
+    """Claim 4: return ||m - mu + gamma P_u'mu||_1 rounded up; infinite where mu is not >= 0."""
+    if not (np.isfinite(mu).all() and (mu >= 0).all()):
+        return math.inf
+    P = lp.rows.matrix(pair).T.tocsr()
+    inflow = lp.gamma * (P @ mu)
+    entries = np.diff(P.indptr)
+    rounding = (entries + 8) * bounds.UNIT * (lp.weight + mu + inflow)
+    residual = np.abs((lp.weight - mu) + inflow) + rounding
+    return math.fsum(residual) * (1 + 4 * bounds.UNIT)
+
+
+def check_refusal(lp: StabilizationLP, w: Floats) -> bool:
+    """Claim 6: w >= 0, w != 0 and w <= gamma P_a w for every surviving pair."""
+    if not (np.isfinite(w).all() and (w >= 0).all() and (w > 0).any()):
+        return False
+    return bounds.holds_for_all(lp, w, lp.gamma, None)
+
+
+def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
+    """Check every claim of a witness against the finite model.
+
+    Parameters
+    ----------
+    lp
+        The finite model.
+    witness
+        Policy and vectors; nothing in it is trusted.
+    tolerance
+        Largest gap that counts as verified.
+    """
+    pair = witness.pair
+    V_up, W, mu, w = witness.V_up, witness.W, witness.mu, witness.w
+    if pair is not None and not _is_policy(lp, pair):
+        pair = None
+    contraction = None if pair is None or w is None else check_stabilizing(lp, pair, w)
+    upper = pair is not None and V_up is not None and check_upper(lp, pair, V_up)
+    lower = W is not None and check_lower(lp, W)
+    residual = None if pair is None or mu is None else check_measure(lp, pair, mu)
+    cost = weighted(lp, V_up) if upper and V_up is not None else None
+    floor = weighted(lp, W) if lower and W is not None else None
+    gap = None
+    if cost is not None and floor is not None:
+        gap = 0.0
+        if cost > 0:
+            gap = max(weighted(lp, V_up - W) / cost * (1 + 8 * bounds.UNIT), 0.0)
+    certificate = Certificate(
+        stabilizing=contraction is not None,
+        upper_bound=upper,
+        lower_bound=lower,
+        measure=residual is not None and residual <= MEASURE_TOLERANCE,
+        refusal=pair is None and w is not None and check_refusal(lp, w),
+        contraction=contraction,
+        cost=cost,
+        lower=floor,
+        gap=gap,
+        measure_residual=residual,
+        tolerance=tolerance,
+    )
+    return _explained(lp, pair, certificate)
+
+
+def weighted(lp: StabilizationLP, values: Floats) -> float:
+    """Return m'values, summed exactly."""
+    return math.fsum(lp.weight * values)
+
+
+def _is_policy(lp: StabilizationLP, pair: Pairs) -> bool:
+    if pair.shape != (lp.n,) or not lp.n:
+        return False
+    return bool((pair >= lp.pair_pointer[:-1]).all() and (pair < lp.pair_pointer[1:]).all())
+
+
+def _explained(
+    lp: StabilizationLP, pair: Pairs | None, certificate: Certificate
+) -> Certificate:
+    from dataclasses import replace
+
+    reasons = []
+    if certificate.refusal:
+        reasons.append(f"proved: no policy has finite cost at gamma = {lp.gamma!r}")
+    elif pair is None:
+        reasons.append("there is no policy to verify")
+    elif not certificate.stabilizing:
+        reasons.append(_not_stabilizing(lp, pair))
+    if pair is not None:
+        if not certificate.upper_bound:
+            reasons.append("no upper bound on the cost of the policy could be established")
+        if not certificate.lower_bound:
+            reasons.append("no lower bound on the optimal cost could be established")
+        if not certificate.measure:
+            shown = certificate.measure_residual
+            reasons.append(
+                "the Lyapunov measure could not be established"
+                + ("" if shown is None else f": its residual is {shown:.2g}, above 1e-9")
+            )
+        gap = certificate.gap
+        if gap is not None and gap > certificate.tolerance:
+            reasons.append(f"the gap {gap:.3g} is above the tolerance {certificate.tolerance:.3g}")
+    return replace(certificate, reasons=tuple(reasons))
+
+
+def _not_stabilizing(lp: StabilizationLP, pair: Pairs) -> str:
+    lost = int((~policy.reaches_attractor(lp, pair)).sum())
+    if lost and lp.gamma < 1:
+        return (
+            f"from {lost} of {lp.n} cells the policy never reaches the attractor: at gamma = "
+            f"{lp.gamma!r} < 1 staying away can be cheaper than going; raise gamma to 1"
+        )
+    if lost:
+        return f"from {lost} of {lp.n} cells the policy never reaches the attractor"
+    return "no contraction of the policy could be proved: the numbers do not allow it"
+
+
+# Making the vectors -------------------------------------------------------------------------
+
+
+def certify(
+    lp: StabilizationLP,
+    pair: Pairs,
+    tolerance: float,
+    value: Floats | None = None,
+    w: Floats | None = None,
+) -> Verified:
+    """Make the vectors of claims 1 to 4 for a policy and check them.
+
+    Parameters
+    ----------
+    lp, pair
+        The finite model and one column per cell.
+    tolerance
+        Largest gap that counts as verified.
+    value, w
+        Guesses of the policy's value and its unit-cost value; made where missing.
+    """
+    w, d = stability_vector(lp, pair, w)
+    V = policy.evaluate(lp, pair, start=value)
+    V_up = None if V is None else upper_vector(lp, pair, V, w, d)
+    W = lower_vector(lp, V, tolerance)
+    mu = None if V is None else _measure_vector(lp, pair)
+    witness = Witness(pair, w, V_up, W, mu)
+    return Verified(check(lp, witness, tolerance), witness)
+
+
+def stability_vector(
+    lp: StabilizationLP, pair: Pairs, guess: Floats | None = None
+) -> tuple[Floats | None, Floats | None]:
+    """Return w > 0 and d > 0 with w >= g P_u w + d: the unit-cost value of the policy.
+
+    Where it spans so many decades that 1 is lost in rounding, the value at a slightly larger
+    weight leaves a relative slack instead.
+    """
+    unit = np.ones(lp.K)
+    if guess is not None and (d := decrease(lp, pair, guess)) is not None:
+        return guess, d
+    for inflation in (0.0, 5e-7, 1e-10):
+        w = policy.evaluate(lp, pair, lp.growth * (1 + inflation), unit, guess)
+        if w is not None and (d := decrease(lp, pair, w)) is not None:
+            return w, d
+    return None, None
+
+
+def upper_vector(
+    lp: StabilizationLP, pair: Pairs, V: Floats, w: Floats | None, d: Floats | None
+) -> Floats | None:
+    """Return V_up = V + delta w with delta >= max(residual / d), None where it fails."""
+    if check_upper(lp, pair, V):
+        return V
+    if w is None or d is None:
+        if lp.gamma >= 1:
+            return None
+        w, d = np.ones(lp.n), np.full(lp.n, (1 - lp.gamma) * 0.99)
+    for _ in range(4):
+        future = bounds.expected_above(lp, pair, V, lp.gamma)
+        residual = bounds.add_above(future, lp.cost[pair]) - V
+        delta = max(float((residual / d).max()), 0.0) * 1.01
+        V = V + delta * w
+        if not np.isfinite(V).all():
+            return None
+        if check_upper(lp, pair, V):
+            return V
+    return None
+
+
+def lower_vector(lp: StabilizationLP, V: Floats | None, tolerance: float) -> Floats:
+    """Return W of claim 3, as large as can be proved from V; 0 always serves."""
+    zero = np.zeros(lp.n)
+    candidates: list[Floats] = []
+    if V is not None:
+        W = _scaled(lp, V)
+        if W is not None:
+            return W
+        start = V * (1 - min(tolerance, 1e-6) / 4)
+        W = bounds.lower_until_below(lp, start, lp.gamma, lp.cost)
+        if W is not None:
+            candidates.append(W)
+    if not candidates or weighted(lp, V - candidates[0]) > tolerance * weighted(lp, V):
+        candidates.append(bounds.raise_from_zero(lp, lp.gamma, lp.cost, 2000))
+    good = [W for W in candidates if check_lower(lp, W)]
+    return max(good, key=lambda W: weighted(lp, W), default=zero)
+
+
+def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
+    """W = (1 - eps) V: it serves once r_a <= eps/(1 - eps) G_a for every surviving pair."""
+    rows = lp.rows
+    worst, stuck = bounds.worst_excess(
+        lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+        lp.gamma, lp.cost, padded(V),
+    )  # fmt: skip
+    if stuck or not worst < 1:
+        return None
+    for margin in (1.0, 2.0, 16.0):
+        eps = margin * worst / (1 + worst) + (margin - 1) * 1e-15
+        W = V * (1 - eps)
+        if check_lower(lp, W):
+            return W
+    return None
+
+
+def _measure_vector(lp: StabilizationLP, pair: Pairs) -> Floats | None:
+    P = lp.rows.matrix(pair).T.tocsr()
+    return linear.solve(lp.gamma * P, lp.weight)

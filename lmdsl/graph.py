@@ -1,0 +1,257 @@
+"""The stabilizable set C, the cause of every other cell, and Algorithm 1, corrected.
+
+C is the greatest set of cells in which every cell keeps an admissible control whose successors
+all lie in C u A, and from which A is reachable through such controls: the almost-sure reachability
+fixed point of Markov decision processes. It alternates "remove cells that cannot reach A" and
+"remove pairs that can leave C" until nothing changes.
+
+Algorithm 1 of the paper grows a tree from A: level L + 1 holds the cells, not in a lower level,
+that some control can send to level L. As printed it never stops with success (it compares the
+levels, A among them, with the cells without A); here it stops when a level is empty, and succeeds
+when every cell has one.
+
+All passes run over the predecessors of each cell, so a pass costs one visit per entry.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lmdsl.rows import Rows
+from lmdsl.transitions import Transitions
+
+
+class CellStatus(IntEnum):
+    """What became of a cell; the codes of ``cell_status``."""
+
+    ATTRACTOR = 0
+    STABILIZED = 1
+    ESCAPES = 2
+    TRAPPED = 3
+    LEADS_TO_THESE = 4
+    AVOID = 5
+
+
+@dataclass(frozen=True)
+class Predecessors:
+    """For every target, the pairs that can reach it: the transpose of the rows' pattern.
+
+    Attributes
+    ----------
+    pointer
+        Shape (columns + 2,): pairs that reach j are ``pair[pointer[j]:pointer[j + 1]]``; the
+        attractor is the last j.
+    pair
+        Pair indices, int32 (int64 where needed), ascending for each target.
+    """
+
+    pointer: NDArray[np.int64]
+    pair: NDArray[np.integer]
+
+    @classmethod
+    def of(cls, rows: Rows) -> Predecessors:
+        """Transpose the pattern of rows."""
+        kind = np.int32 if rows.count < 2**31 else np.int64
+        pointer = np.zeros(rows.columns + 2, dtype=np.int64)
+        pair = np.empty(len(rows.target), dtype=kind)
+        _transpose(rows.pointer, rows.target, pointer, pair)
+        return cls(pointer, pair)
+
+
+@dataclass(frozen=True)
+class Stabilizable:
+    """The stabilizable set of a set of transitions.
+
+    Attributes
+    ----------
+    inside
+        Which free cells lie in C, shape (F,).
+    surviving
+        Which pairs survive: cell in C, every successor in C u A, shape (pairs,).
+    reaches
+        Free cells from which A can be reached through admissible pairs, shape (F,).
+    """
+
+    inside: NDArray[np.bool_]
+    surviving: NDArray[np.bool_]
+    reaches: NDArray[np.bool_]
+
+
+def stabilizable(pair_pointer: NDArray[np.int64], rows: Rows) -> Stabilizable:
+    """Return the greatest set from which A is reached almost surely, and the pairs it keeps."""
+    before = Predecessors.of(rows)
+    cells = rows.columns
+    cell = owner(pair_pointer)
+    alive = np.ones(rows.count, dtype=np.bool_)
+    inside = np.ones(cells, dtype=np.bool_)
+    choices = np.diff(pair_pointer)
+    reaches = None
+    while True:
+        level, _ = _levels(before.pointer, before.pair, cell, alive, cells)
+        reached = level >= 0
+        if reaches is None:
+            reaches = reached
+        lost = np.flatnonzero(inside & ~reached)
+        if not len(lost):
+            return Stabilizable(inside, alive, reaches)
+        _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)
+
+
+def causes(found: Stabilizable, pair_pointer: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Return the status code of every free cell (see :class:`CellStatus`), shape (F,)."""
+    status = np.full(len(found.inside), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
+    status[~found.reaches] = CellStatus.TRAPPED
+    status[np.diff(pair_pointer) == 0] = CellStatus.ESCAPES
+    status[found.inside] = CellStatus.STABILIZED
+    return status
+
+
+def tree(
+    pair_pointer: NDArray[np.int64],
+    rows: Rows,
+    allowed: NDArray[np.bool_] | None = None,
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Algorithm 1, corrected: breadth-first levels from A, and the pair that put a cell there.
+
+    Parameters
+    ----------
+    pair_pointer, rows
+        The pairs by cell, ordered by control, and their transitions.
+    allowed
+        Which pairs may be used; default all.
+
+    Returns
+    -------
+    level : ndarray of int32, shape (cells,)
+        Number of steps in which A can be reached; -1 where it cannot.
+    pair : ndarray of int64, shape (cells,)
+        The first pair of the cell (smallest control) that can enter the level below; -1 where
+        there is none. On the surviving pairs this policy is stabilizing: each cell has a positive
+        chance to descend, and none can leave.
+    """
+    before = Predecessors.of(rows)
+    if allowed is None:
+        allowed = np.ones(rows.count, dtype=np.bool_)
+    level, pair = _levels(before.pointer, before.pair, owner(pair_pointer), allowed, rows.columns)
+    return level, pair
+
+
+def restrict(
+    transitions: Transitions, found: Stabilizable
+) -> tuple[NDArray[np.int64], NDArray[np.int64], Rows]:
+    """Keep the surviving pairs and number the cells of C.
+
+    Returns
+    -------
+    kept : pair indices that survive, ascending
+    pair_pointer : pairs by cell of C
+    rows : their rows, targets numbering the cells of C, |C| for the attractor
+    """
+    rows = transitions.rows
+    kept = np.flatnonzero(found.surviving)
+    n = int(found.inside.sum())
+    if n == rows.columns and len(kept) == rows.count:
+        return kept, transitions.pair_pointer, rows
+    per_cell = np.add.reduceat(
+        np.append(found.surviving, False), transitions.pair_pointer[:-1], dtype=np.int64
+    )
+    per_cell[np.diff(transitions.pair_pointer) == 0] = 0
+    pair_pointer = np.concatenate([[0], np.cumsum(per_cell[found.inside])]).astype(np.int64)
+    renumber = np.full(rows.columns + 1, -1, dtype=np.int32)
+    renumber[np.flatnonzero(found.inside)] = np.arange(n, dtype=np.int32)
+    renumber[rows.columns] = n
+    length = np.diff(rows.pointer)
+    entry = np.repeat(found.surviving, length)
+    pointer = np.concatenate([[0], np.cumsum(length[kept])]).astype(np.int64)
+    smaller = Rows(pointer, renumber[rows.target[entry]], rows.code[entry], rows.shares, n)
+    return kept, pair_pointer, smaller
+
+
+def owner(pair_pointer: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the cell of every pair, shape (pairs,)."""
+    return np.repeat(
+        np.arange(len(pair_pointer) - 1, dtype=np.int32), np.diff(pair_pointer)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _transpose(pointer, target, out_pointer, pair):  # type: ignore[no-untyped-def]
+    for e in range(len(target)):
+        out_pointer[target[e] + 1] += 1
+    for j in range(len(out_pointer) - 1):
+        out_pointer[j + 1] += out_pointer[j]
+    position = out_pointer[:-1].copy()
+    for k in range(len(pointer) - 1):
+        for e in range(pointer[k], pointer[k + 1]):
+            j = target[e]
+            pair[position[j]] = k
+            position[j] += 1
+
+
+@njit(cache=True, nogil=True)
+def _levels(pointer, pair, cell, alive, cells):  # type: ignore[no-untyped-def]
+    """Breadth-first levels from the attractor (number ``cells``) against alive pairs."""
+    level = np.full(cells, -1, dtype=np.int32)
+    choice = np.full(cells, -1, dtype=np.int64)
+    queue = np.empty(cells, dtype=np.int64)
+    end = 0
+    for e in range(pointer[cells], pointer[cells + 1]):
+        k = pair[e]
+        if alive[k]:
+            i = cell[k]
+            if level[i] < 0:
+                level[i] = 1
+                choice[i] = k
+                queue[end] = i
+                end += 1
+            elif k < choice[i]:
+                choice[i] = k
+    start = 0
+    while start < end:
+        j = queue[start]
+        start += 1
+        below = level[j]
+        for e in range(pointer[j], pointer[j + 1]):
+            k = pair[e]
+            if alive[k]:
+                i = cell[k]
+                if level[i] < 0:
+                    level[i] = below + 1
+                    choice[i] = k
+                    queue[end] = i
+                    end += 1
+                elif level[i] == below + 1 and k < choice[i]:
+                    choice[i] = k
+    return level, choice
+
+
+@njit(cache=True, nogil=True)
+def _remove(lost, pointer, pair, cell, pair_pointer, alive, inside, choices):  # type: ignore[no-untyped-def]
+    """Remove cells, the pairs that can reach them, and cells left without a pair."""
+    queue = np.empty(len(inside), dtype=np.int64)
+    end = 0
+    for i in lost:
+        inside[i] = False
+        queue[end] = i
+        end += 1
+    start = 0
+    while start < end:
+        j = queue[start]
+        start += 1
+        for k in range(pair_pointer[j], pair_pointer[j + 1]):
+            alive[k] = False
+        for e in range(pointer[j], pointer[j + 1]):
+            k = pair[e]
+            if alive[k]:
+                alive[k] = False
+                i = cell[k]
+                choices[i] -= 1
+                if choices[i] == 0 and inside[i]:
+                    inside[i] = False
+                    queue[end] = i
+                    end += 1

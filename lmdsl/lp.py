@@ -1,0 +1,245 @@
+"""The stabilization LP: the finite model on C, and A, b, c made on demand.
+
+Primal (the paper's equation for theta):  min G'theta  s.t.  (E - gamma P)'theta = m, theta >= 0.
+Dual:  max m'V  s.t.  V[cell(k)] <= gamma (P V)[k] + G[k] for every surviving pair k.
+So ``A = (E - gamma P)'`` is (n, K), ``b = m``, ``c = G``; columns go by cell, then control.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl import graph
+from lmdsl.errors import BadInput
+from lmdsl.files import write_whole
+from lmdsl.graph import CellStatus, Predecessors
+from lmdsl.partition import Partition
+from lmdsl.problem import Problem
+from lmdsl.rows import Rows
+from lmdsl.sampling import control_vectors
+from lmdsl.transitions import Progress, assemble
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StabilizationLP:
+    """The finite model of a problem on its stabilizable set, and its linear program.
+
+    Attributes
+    ----------
+    problem, partition
+        What was compiled.
+    controls
+        Control vectors, shape (M, p).
+    cell_status
+        Shape (N,), codes of :class:`lmdsl.graph.CellStatus`.
+    cells
+        The cells of C by their index in the state box, ascending, shape (n,).
+    pair_pointer
+        Shape (n + 1,): the columns of the i-th cell of C are ``pair_pointer[i]:pair_pointer[i+1]``.
+    control
+        Control index of every column, shape (K,), int32.
+    rows
+        Compact transition rows P, one per column; target n is the attractor.
+    cost
+        Stage cost G of every column, shape (K,).
+    gamma
+        Geometric weight of the cost.
+    weight
+        The user's m on C, shape (n,), sum 1; zeros outside the support (all zero where no cell of
+        ``measure`` lies in C).
+
+    Notes
+    -----
+    Backends solve with :attr:`solve_weight`, uniform on C: the optimal V does not depend on a
+    positive weight, while zeros in m would leave V and the controls undetermined there.
+    """
+
+    problem: Problem
+    partition: Partition
+    controls: Floats
+    cell_status: NDArray[np.uint8]
+    cells: NDArray[np.int64]
+    pair_pointer: NDArray[np.int64]
+    control: NDArray[np.int32]
+    rows: Rows
+    cost: Floats
+    gamma: float
+    weight: Floats
+
+    @property
+    def n(self) -> int:
+        """Number of cells of C: rows of the LP."""
+        return len(self.cells)
+
+    @property
+    def K(self) -> int:
+        """Number of surviving pairs: columns of the LP."""
+        return len(self.control)
+
+    @cached_property
+    def cell(self) -> NDArray[np.int32]:
+        """The cell of every column as a position in ``cells``, shape (K,)."""
+        return graph.owner(self.pair_pointer)
+
+    @property
+    def A(self) -> Any:
+        """(E - gamma P)', shape (n, K), a SciPy CSC array made anew on each call."""
+        from scipy.sparse import csr_array
+
+        E = csr_array(
+            (np.ones(self.K), self.cell, np.arange(self.K + 1)), shape=(self.K, self.n)
+        )
+        return (E - self.gamma * self.P).T.tocsc()
+
+    @property
+    def b(self) -> Floats:
+        """The user's m, shape (n,)."""
+        return self.weight
+
+    @property
+    def c(self) -> Floats:
+        """The stage costs, shape (K,)."""
+        return self.cost
+
+    @property
+    def P(self) -> Any:
+        """Transition rows of every column, shape (K, n), a SciPy CSR array made anew."""
+        return self.rows.matrix()
+
+    @property
+    def solve_weight(self) -> Floats:
+        """The weight backends solve with: uniform on C, shape (n,), sum 1."""
+        return np.full(self.n, 1.0 / max(self.n, 1))
+
+    @property
+    def growth(self) -> float:
+        """g = max(gamma, 1): the weight under which a policy must be stabilizing."""
+        return max(self.gamma, 1.0)
+
+    def column(self, cell: int, control: int) -> int | None:
+        """Return the column of (cell index in the box, control index), None if not surviving."""
+        i = int(np.searchsorted(self.cells, cell))
+        if i >= self.n or self.cells[i] != cell:
+            return None
+        first, last = self.pair_pointer[i], self.pair_pointer[i + 1]
+        k = first + int(np.searchsorted(self.control[first:last], control))
+        return int(k) if k < last and self.control[k] == control else None
+
+    @cached_property
+    def tree(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""
+        return graph.tree(self.pair_pointer, self.rows)
+
+    @cached_property
+    def predecessors(self) -> Predecessors:
+        """Columns that can reach each cell."""
+        return Predecessors.of(self.rows)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the compiled model: statuses, pairs, exact transitions, costs, gamma, m."""
+        sha = hashlib.sha256(b"lmdsl model 1\n")
+        sha.update(repr((self.rows.shares.total, self.rows.shares.numerator)).encode())
+        sha.update(np.array([self.gamma], dtype="<f8").tobytes())
+        for array, kind in (
+            (self.cell_status, "<u1"),
+            (self.pair_pointer, "<i8"),
+            (self.control, "<i4"),
+            (self.rows.pointer, "<i8"),
+            (self.rows.target, "<i4"),
+            (self.rows.code, "<u4"),
+            (self.cost, "<f8"),
+            (self.weight, "<f8"),
+            (self.controls, "<f8"),
+        ):
+            for part in np.array_split(array.ravel(), max(1, array.size // 2**22)):
+                sha.update(np.ascontiguousarray(part, dtype=kind).tobytes())
+        return sha.hexdigest()
+
+    def expand(self, values: NDArray[Any], attractor: Any, outside: Any) -> NDArray[Any]:
+        """Spread values on C over all N cells."""
+        full = np.full(self.partition.size, outside, dtype=values.dtype)
+        full[self.cell_status == CellStatus.ATTRACTOR] = attractor
+        full[self.cells] = values
+        return full
+
+    def write_mps(self, path: str | os.PathLike[str]) -> None:
+        """Write the LP in free MPS format, every double with all its digits.
+
+        Row ``d<cell>`` is the balance of a cell, column ``t<cell>_<control>`` its occupation.
+        """
+        if not self.n:
+            raise BadInput("the stabilizable set is empty; there is no LP to write")
+        A = self.A
+        lines = ["NAME lmdsl", "ROWS", " N cost", *(f" E d{i}" for i in self.cells), "COLUMNS"]
+        names = [f"d{i}" for i in self.cells]
+        cell = self.cells[self.cell]
+        for k in range(self.K):
+            column = f" t{cell[k]}_{self.control[k]}"
+            lines.append(f"{column} cost {float(self.cost[k])!r}")
+            span = slice(A.indptr[k], A.indptr[k + 1])
+            lines += [
+                f"{column} {names[i]} {float(v)!r}"
+                for i, v in zip(A.indices[span], A.data[span], strict=True)
+            ]
+        lines.append("RHS")
+        lines += [f" m {names[i]} {float(self.b[i])!r}" for i in np.flatnonzero(self.b)]
+        write_whole(Path(path), ("\n".join([*lines, "ENDATA"]) + "\n").encode())
+
+    def __repr__(self) -> str:
+        return (
+            f"StabilizationLP({self.n} rows, {self.K} columns, {len(self.rows.target)} transitions,"
+            f" gamma={self.gamma!r})"
+        )
+
+
+def compile(problem: Problem, progress: Progress | None = None) -> StabilizationLP:  # noqa: A001
+    """Compile a problem: transitions, stabilizable set and the LP on it.
+
+    Parameters
+    ----------
+    problem
+        The declared problem.
+    progress
+        Called with (stage, fraction done) during long work.
+
+    Raises
+    ------
+    BadInput
+        The declared sets have no cells, the stage cost is negative or not finite, or the problem
+        does not fit in memory.
+    """
+    partition = Partition.of(problem)
+    transitions = assemble(problem, partition, progress)
+    regions = transitions.regions
+    found = graph.stabilizable(transitions.pair_pointer, transitions.rows)
+    kept, pair_pointer, rows = graph.restrict(transitions, found)
+    status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)
+    status[regions.free] = graph.causes(found, transitions.pair_pointer)
+    status[regions.attractor] = CellStatus.ATTRACTOR
+    cells = regions.free[found.inside]
+    support = regions.support[cells]
+    everything = len(kept) == len(transitions.control)
+    return StabilizationLP(
+        problem=problem,
+        partition=partition,
+        controls=control_vectors(problem),
+        cell_status=status,
+        cells=cells,
+        pair_pointer=pair_pointer,
+        control=transitions.control if everything else transitions.control[kept],
+        rows=rows,
+        cost=transitions.cost if everything else transitions.cost[kept],
+        gamma=problem.gamma,
+        weight=support / max(int(support.sum()), 1),
+    )

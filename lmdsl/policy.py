@@ -1,0 +1,284 @@
+"""Policies of the finite model: evaluate, improve, break ties, and find a first stabilizing one.
+
+A policy is an array of columns, one per cell of C (``pair``). P_u, G_u are its rows. It is
+*gamma-stabilizing* when the spectral radius of gamma P_u is below 1; then its value
+V = G_u + gamma P_u V is finite. Write g = max(gamma, 1).
+
+Howard's policy iteration from a g-stabilizing policy that changes a control only where strictly
+better keeps every policy g-stabilizing, zeros in the cost included: on a recurrent class of a bad
+new policy, V >= gamma P V + G forces equality everywhere, so nothing there was changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl import bellman, graph, linear
+from lmdsl.lp import StabilizationLP
+
+Floats = NDArray[np.float64]
+Pairs = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Stop = Callable[[], bool]
+
+TIE = 1e-12
+"""Relative difference in Q up to which two controls count as tied."""
+
+
+def evaluate(
+    lp: StabilizationLP,
+    pair: Pairs,
+    gamma: float | None = None,
+    cost: Floats | None = None,
+    start: Floats | None = None,
+) -> Floats | None:
+    """Return V = G_u + gamma P_u V, shape (n,); None where the policy has no finite value.
+
+    Parameters
+    ----------
+    lp, pair
+        The model, and one column per cell.
+    gamma, cost
+        Other than the LP's own; ``cost`` has shape (K,).
+    start
+        A guess of V.
+    """
+    gamma = lp.gamma if gamma is None else gamma
+    cost = lp.cost if cost is None else cost
+    P = lp.rows.matrix(pair)
+    if gamma >= 1 and not reaches_attractor(lp, pair, P).all():
+        return None
+    return linear.solve(gamma * P, cost[pair], start)
+
+
+def reaches_attractor(lp: StabilizationLP, pair: Pairs, P: object | None = None) -> Bools:
+    """Return the cells from which the policy can reach A, shape (n,)."""
+    level, _ = graph.tree(np.arange(lp.n + 1, dtype=np.int64), lp.rows.take(pair))
+    return level >= 0
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """The outcome of policy iteration.
+
+    Attributes
+    ----------
+    pair, value
+        The last policy and its value.
+    steps
+        Improvement steps that changed the policy.
+    converged
+        False when stopped early.
+    """
+
+    pair: Pairs
+    value: Floats
+    steps: int
+    converged: bool
+
+
+def iterate(
+    lp: StabilizationLP,
+    pair: Pairs,
+    value: Floats,
+    gamma: float | None = None,
+    cost: Floats | None = None,
+    allowed: Bools | None = None,
+    stop: Stop = lambda: False,
+    limit: int = 1000,
+) -> Iteration:
+    """Howard's policy iteration from a policy and its value."""
+    for step in range(limit):
+        if stop():
+            return Iteration(pair, value, step, False)
+        better = bellman.improve(lp, value, gamma, cost, allowed)
+        change = better.value < value - TIE * np.abs(value)
+        if not change.any():
+            return Iteration(pair, value, step, True)
+        new = np.where(change, better.pair, pair)
+        new_value = evaluate(lp, new, gamma, cost, value)
+        if new_value is None:  # rounding made a change look better than it is
+            return Iteration(pair, value, step, True)
+        pair, value = new, new_value
+    return Iteration(pair, value, limit, False)
+
+
+def canonical(lp: StabilizationLP, pair: Pairs, value: Floats) -> Pairs:
+    """Break ties so that the policy reaches A: the policy that every backend ends with.
+
+    Tied are the columns with Q <= Q_min + 1e-12 |Q_min|. Among them take those optimal for unit
+    cost weighted with g, then the smallest control index; cells from which that cost is infinite
+    take the smallest tied index.
+
+    Parameters
+    ----------
+    lp, pair, value
+        The model, an optimal policy and its value.
+    """
+    best = bellman.improve(lp, value).value
+    ties = bellman.tied(lp, value, best, TIE)
+    ties[pair] = True
+    choices = np.add.reduceat(ties, lp.pair_pointer[:-1], dtype=np.int64)
+    first = first_column(lp, ties)
+    if (choices == 1).all():
+        return first
+    found = graph.stabilizable(*_columns(lp, ties))
+    if not found.inside.any():
+        return first
+    columns = np.flatnonzero(ties)[found.surviving]
+    inside = np.flatnonzero(found.inside)
+    sub = _sub_lp(lp, columns, inside)
+    unit = np.ones(sub.K)
+    start = np.searchsorted(columns, pair[inside])
+    start = np.minimum(start, len(columns) - 1)
+    owned = columns[start] == pair[inside]
+    if not owned.all():
+        start = np.where(owned, start, sub.tree[1])
+    w = evaluate(sub, start, lp.growth, unit)
+    if w is None:
+        start = sub.tree[1]
+        w = evaluate(sub, start, lp.growth, unit)
+    if w is None:
+        return pair
+    done = iterate(sub, start, w, lp.growth, unit)
+    least = bellman.improve(sub, done.value, lp.growth, unit).value
+    equal = bellman.tied(replace(sub, gamma=lp.growth, cost=unit), done.value, least, TIE)
+    chosen = first.copy()
+    chosen[inside] = columns[first_column(sub, equal)]
+    return chosen
+
+
+def first_column(lp: StabilizationLP, allowed: Bools) -> Pairs:
+    """Return the first allowed column of every cell (each cell must have one)."""
+    position = np.where(allowed, np.arange(lp.K), lp.K)
+    return np.minimum.reduceat(position, lp.pair_pointer[:-1]).astype(np.int64)
+
+
+def _columns(lp: StabilizationLP, allowed: Bools):  # type: ignore[no-untyped-def]
+    count = np.add.reduceat(allowed, lp.pair_pointer[:-1], dtype=np.int64)
+    pointer = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
+    return pointer, lp.rows.take(np.flatnonzero(allowed))
+
+
+def _sub_lp(lp: StabilizationLP, columns: Pairs, inside: Pairs) -> StabilizationLP:
+    """Return the model on some cells and columns; every successor must lie inside or in A."""
+    renumber = np.full(lp.n + 1, -1, dtype=np.int32)
+    renumber[inside] = np.arange(len(inside), dtype=np.int32)
+    renumber[lp.n] = len(inside)
+    taken = lp.rows.take(columns)
+    rows = replace(taken, target=renumber[taken.target], columns=len(inside))
+    count = np.bincount(renumber[lp.cell[columns]], minlength=len(inside))
+    return replace(
+        lp,
+        cells=lp.cells[inside],
+        pair_pointer=np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
+        control=lp.control[columns],
+        rows=rows,
+        cost=lp.cost[columns],
+        weight=lp.weight[inside],
+    )
+
+
+@dataclass(frozen=True)
+class Feasible:
+    """A gamma-stabilizing policy, with its unit-cost value w = 1 + g P_u w."""
+
+    pair: Pairs
+    w: Floats
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A candidate proof that no policy is gamma-stabilizing: w >= 0, w <= gamma P_a w for all a.
+
+    ``lower`` is a gamma at which a policy is known to be stabilizing.
+    """
+
+    w: Floats
+    lower: float
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """gamma is so close to its limit that doubles decide neither way."""
+
+    lower: float
+
+
+def stabilizing(lp: StabilizationLP, stop: Stop = lambda: False) -> Feasible | Refused | Undecided:
+    """Find a policy that is stabilizing with weight g = max(gamma, 1), or a proof against it.
+
+    Algorithm 1 gives the first policy. For gamma > 1, gamma is raised from 1 in steps, each below
+    the limit of the last policy, under unit cost (under a cost with zeros this can stall).
+    """
+    g, unit = lp.growth, np.ones(lp.K)
+    pair = lp.tree[1]
+    w = evaluate(lp, pair, g, unit)
+    if w is not None:
+        return Feasible(pair, w)
+    at, value = 1.0, evaluate(lp, pair, 1.0, unit)
+    if value is None:
+        return Undecided(0.0)
+    reach = g
+    refused_at = 0
+    for step in range(200):
+        if stop():
+            return Undecided(at)
+        done = iterate(lp, pair, value, at, unit, stop=stop)
+        pair, value = done.pair, done.value
+        w = evaluate(lp, pair, g, unit)
+        if w is not None:
+            return Feasible(pair, w)
+        if step == refused_at:
+            refused_at = 2 * refused_at + 4
+            proof = refusal(lp, stop)
+            if proof is not None:
+                return Refused(proof, at)
+        # Raise gamma as far towards g as this policy allows, by bisection from above.
+        reach, raised = g, None
+        while raised is None and reach > at * (1 + 1e-13):
+            reach = at + (reach - at) / 2
+            raised = evaluate(lp, pair, reach, unit)
+        if raised is None:
+            return Undecided(at)
+        at, value = reach, raised
+    return Undecided(at)
+
+
+def refusal(lp: StabilizationLP, stop: Stop = lambda: False) -> Floats | None:
+    """Return w >= 0, w != 0 that should satisfy w <= gamma P_a w for every pair, or None.
+
+    w is the greatest solution of w = min(1, gamma' min_a P_a w) with gamma' just below gamma (the
+    slack absorbs rounding) or gamma itself: optimal stopping, solved by policy iteration from
+    "stop everywhere", w = 1. It is 0 exactly when gamma' < gamma_bar.
+    """
+    zero = np.zeros(lp.K)
+    for slack in (1e-6, 1e-9, 1e-12, 0.0):
+        gamma = lp.gamma * (1 - slack)
+        w: Floats = np.ones(lp.n)
+        going = np.zeros(lp.n, dtype=np.bool_)
+        pair = lp.pair_pointer[:-1].copy()
+        for _ in range(1000):
+            if stop():
+                return None
+            better = bellman.improve(lp, w, gamma, zero)
+            change = better.value < w * (1 - 1e-13)
+            if not change.any():
+                break
+            pair = np.where(change, better.pair, pair)
+            going |= change
+            P = gamma * lp.rows.matrix(pair[going])
+            new = linear.solve(P[:, going], P[:, ~going].sum(axis=1))
+            if new is None:
+                break
+            w = np.ones(lp.n)
+            w[going] = np.minimum(new, 1.0)
+        top = float(w.max(initial=0.0))
+        if top > 1e-9:
+            # Cells at rounding level carry no mass: their own rows then ask 0 <= something.
+            return np.where(w > 1e-14 * top, w, 0.0)
+    return None

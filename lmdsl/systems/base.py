@@ -1,0 +1,271 @@
+"""What a system is: states, and a function that maps arrays of states to their images.
+
+Every system answers one question, ``compile(states, controls, noise)``: a function of named
+arrays that broadcast against each other, which returns one array of images per state. Formulas
+and users' own Python functions meet the same contract, so everything downstream (transitions,
+simulation, plots) treats them alike. Every right-hand side sees the old values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from lmdsl.declared import Count, Declared, Formulas, Number, Parameters
+from lmdsl.errors import BadInput, shown
+from lmdsl.formulas import parse
+from lmdsl.program import Program
+
+Array = NDArray[np.float64]
+Step = Callable[[Mapping[str, Any]], tuple[Array, ...]]
+
+Substeps = Annotated[Count, Field(le=1000)]
+Duration = Annotated[Number, Field(gt=0)]
+
+
+def program(
+    formulas: Mapping[str, str],
+    order: Sequence[str],
+    names: Sequence[str],
+    parameters: Mapping[str, float],
+    where: str,
+) -> Program:
+    """Compile the formulas of the states, in the given order, into one program.
+
+    Raises
+    ------
+    BadInput
+        A formula is missing, belongs to no state, or cannot be parsed.
+    """
+    for state in order:
+        if state not in formulas:
+            raise BadInput(f"no formula for state {state!r}; add one", where)
+    for state in formulas:
+        if state not in order:
+            raise BadInput(
+                f"{shown(state)} is not an axis of state_box; remove it or declare the axis", where
+            )
+    known = [*names, *parameters]
+    parsed = []
+    for state in order:
+        try:
+            parsed.append(parse(formulas[state], known))
+        except BadInput as error:
+            raise BadInput(error.message, f"{where}.{state}") from None
+    return Program(parsed, parameters)
+
+
+class System(Declared):
+    """Base of all systems x+ = T(x, u, w)."""
+
+    parameters: Parameters = Field(default_factory=dict, validate_default=True)
+
+    def constants(self) -> Mapping[str, float]:
+        """Return the values of all parameters, defaults included."""
+        return self.parameters
+
+    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+        """Return the function from named arrays to the images, one array per state in order."""
+        raise NotImplementedError
+
+
+class MapSystem(System):
+    """A discrete-time map: one formula per state.
+
+    Attributes
+    ----------
+    next
+        State name to the formula of its next value, in states, controls, noise and parameters.
+    """
+
+    kind: Literal["map"] = "map"
+    next: Formulas
+
+    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+        """See :meth:`System.compile`."""
+        return program(
+            self.next, states, [*states, *controls, *noise], self.parameters, "system.next"
+        )
+
+
+class OdeSystem(System):
+    """An ordinary differential equation, sampled by the classical Runge-Kutta method (RK4).
+
+    Attributes
+    ----------
+    derivative
+        State name to the formula of its time derivative.
+    step
+        Sampling time: control and noise are held during it. In the units of the derivative.
+    substeps
+        RK4 steps per sampling time; only the final image is judged.
+    """
+
+    kind: Literal["ode"] = "ode"
+    derivative: Formulas
+    step: Duration
+    substeps: Substeps = 1
+
+    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+        """See :meth:`System.compile`."""
+        field = program(
+            self.derivative,
+            states,
+            [*states, *controls, *noise],
+            self.parameters,
+            "system.derivative",
+        )
+        return _RungeKutta(field, tuple(states), self.step, self.substeps)
+
+
+class _RungeKutta:
+    """x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4), repeated; h = step / substeps."""
+
+    def __init__(self, field: Step, states: tuple[str, ...], step: float, substeps: int) -> None:
+        self.field, self.states = field, states
+        self.substeps, self.h = substeps, step / substeps
+
+    def __call__(self, values: Mapping[str, Any]) -> tuple[Array, ...]:
+        held = dict(values)
+        state: tuple[Array, ...] = tuple(np.asarray(held[name], float) for name in self.states)
+        h = self.h
+
+        def slope(at: Sequence[Array]) -> tuple[Array, ...]:
+            held.update(zip(self.states, at, strict=True))
+            return self.field(held)
+
+        with np.errstate(all="ignore"):
+            for _ in range(self.substeps):
+                k1 = slope(state)
+                k2 = slope([x + (h / 2) * k for x, k in zip(state, k1, strict=True)])
+                k3 = slope([x + (h / 2) * k for x, k in zip(state, k2, strict=True)])
+                k4 = slope([x + h * k for x, k in zip(state, k3, strict=True)])
+                state = tuple(
+                    x + (h / 6) * (a + 2 * b + 2 * c + d)
+                    for x, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
+                )
+        return state
+
+
+class NamedSystem(System):
+    """A system known by name: its formulas are fixed, its parameters have defaults.
+
+    A subclass sets ``defaults`` (parameter values), ``source`` (a citation), ``summary`` (one
+    line) and ``problem`` (the problem file that ``lmdsl init NAME`` writes).
+    """
+
+    kind: str
+    defaults: ClassVar[Mapping[str, float]] = {}
+    source: ClassVar[str] = ""
+    summary: ClassVar[str] = ""
+    problem: ClassVar[Mapping[str, Any]] = {}
+
+    @model_validator(mode="after")
+    def _known_parameters(self) -> NamedSystem:
+        for name in self.parameters:
+            if name not in self.defaults:
+                known = ", ".join(self.defaults) or "none"
+                raise BadInput(
+                    f"{shown(name)} is not a parameter of {self.kind}; its parameters: {known}",
+                    "parameters",
+                )
+        return self
+
+    def constants(self) -> Mapping[str, float]:
+        """Return the values of all parameters, defaults included."""
+        return {**self.defaults, **self.parameters}
+
+
+class NamedMap(NamedSystem):
+    """A named discrete-time map; a subclass sets ``formulas``."""
+
+    formulas: ClassVar[Mapping[str, str]] = {}
+
+    def definition(self) -> MapSystem:
+        """Return the same system with its formulas written out."""
+        return MapSystem(parameters=dict(self.constants()), next=dict(self.formulas))
+
+    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+        """See :meth:`System.compile`."""
+        return self.definition().compile(states, controls, noise)
+
+
+class NamedOde(NamedSystem):
+    """A named differential equation; a subclass sets ``formulas`` and defaults for the step.
+
+    Attributes
+    ----------
+    step
+        Sampling time in seconds (or in the time unit of the equations).
+    substeps
+        RK4 steps per sampling time.
+    """
+
+    formulas: ClassVar[Mapping[str, str]] = {}
+    step: Duration = 0.1
+    substeps: Substeps = 1
+
+    def definition(self) -> OdeSystem:
+        """Return the same system with its formulas written out."""
+        return OdeSystem(
+            parameters=dict(self.constants()),
+            derivative=dict(self.formulas),
+            step=self.step,
+            substeps=self.substeps,
+        )
+
+    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+        """See :meth:`System.compile`."""
+        return self.definition().compile(states, controls, noise)
+
+
+class FunctionSystem(System):
+    """A system written as a Python function; it works everywhere except in JSON files.
+
+    Attributes
+    ----------
+    next
+        ``next(**values)`` receives every state, control, noise variable and parameter by name, as
+        arrays that broadcast against each other, and returns the images: a mapping from state
+        names, or a sequence in the order of the axes. It must be vectorised (NumPy semantics)
+        and must not keep state between calls.
+
+    Examples
+    --------
+    >>> import lmdsl as lm
+    >>> lm.systems.FunctionSystem(next=lambda x, u: {"x": 0.5 * x + u}).kind
+    'function'
+    """
+
+    kind: Literal["function"] = "function"
+    next: Callable[..., Any] = Field(exclude=True)
+
+    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+        """See :meth:`System.compile`."""
+        names = tuple(states)
+        parameters = dict(self.parameters)
+        function = self.next
+
+        def step(values: Mapping[str, Any]) -> tuple[Array, ...]:
+            with np.errstate(all="ignore"):
+                images = function(**values, **parameters)
+            if isinstance(images, Mapping):
+                if set(images) != set(names):
+                    raise BadInput(
+                        f"the function returned {sorted(images)}, not {sorted(names)}",
+                        "system.next",
+                    )
+                images = [images[name] for name in names]
+            images = tuple(np.asarray(image, dtype=np.float64) for image in images)
+            if len(images) != len(names):
+                raise BadInput(
+                    f"the function returned {len(images)} images for {len(names)} states",
+                    "system.next",
+                )
+            return images
+
+        return step
