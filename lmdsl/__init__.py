@@ -1,1 +1,60 @@
-"""lmdsl."""
+"""Optimal stabilization with Lyapunov measures: from a declared system to a verified controller.
+
+The public names; each is imported when first used, so ``import lmdsl`` loads no solver.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lmdsl import backends as backends
+    from lmdsl import systems as systems
+    from lmdsl.certificate import Certificate as Certificate
+    from lmdsl.controller import Controller as Controller
+    from lmdsl.controller import Simulation as Simulation
+    from lmdsl.errors import BadInput as BadInput
+    from lmdsl.errors import LmdslError as LmdslError
+    from lmdsl.graph import CellStatus as CellStatus
+    from lmdsl.lp import StabilizationLP as StabilizationLP
+    from lmdsl.lp import compile as compile
+    from lmdsl.problem import Problem as Problem
+    from lmdsl.problem import load as load
+    from lmdsl.result import Result as Result
+    from lmdsl.stabilize import solve as solve
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "BadInput": "errors",
+    "CellStatus": "graph",
+    "Certificate": "certificate",
+    "Controller": "controller",
+    "LmdslError": "errors",
+    "Problem": "problem",
+    "Result": "result",
+    "Simulation": "controller",
+    "StabilizationLP": "lp",
+    "compile": "lp",
+    "load": "problem",
+    "solve": "stabilize",
+}
+_MODULES = ("backends", "systems")
+
+__all__ = ["__version__", *_HOME, *_MODULES]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME:
+        value = getattr(import_module(f"lmdsl.{_HOME[name]}"), name)
+    elif name in _MODULES:
+        value = import_module(f"lmdsl.{name}")
+    else:
+        raise AttributeError(f"module 'lmdsl' has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

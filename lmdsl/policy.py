@@ -195,17 +195,22 @@ class Feasible:
 class Refused:
     """A candidate proof that no policy is gamma-stabilizing: w >= 0, w <= gamma P_a w for all a.
 
-    ``lower`` is a gamma at which a policy is known to be stabilizing.
+    ``pair`` is a policy that is stabilizing at ``lower`` < gamma.
     """
 
     w: Floats
+    pair: Pairs
     lower: float
 
 
 @dataclass(frozen=True)
 class Undecided:
-    """gamma is so close to its limit that doubles decide neither way."""
+    """gamma is so close to its limit that doubles decide neither way, or time ran out.
 
+    ``pair`` is a policy that is stabilizing at ``lower`` < gamma.
+    """
+
+    pair: Pairs
     lower: float
 
 
@@ -222,12 +227,12 @@ def stabilizing(lp: StabilizationLP, stop: Stop = lambda: False) -> Feasible | R
         return Feasible(pair, w)
     at, value = 1.0, evaluate(lp, pair, 1.0, unit)
     if value is None:
-        return Undecided(0.0)
+        return Undecided(pair, 0.0)
     reach = g
     refused_at = 0
     for step in range(200):
         if stop():
-            return Undecided(at)
+            return Undecided(pair, at)
         done = iterate(lp, pair, value, at, unit, stop=stop)
         pair, value = done.pair, done.value
         w = evaluate(lp, pair, g, unit)
@@ -237,16 +242,16 @@ def stabilizing(lp: StabilizationLP, stop: Stop = lambda: False) -> Feasible | R
             refused_at = 2 * refused_at + 4
             proof = refusal(lp, stop)
             if proof is not None:
-                return Refused(proof, at)
+                return Refused(proof, pair, at)
         # Raise gamma as far towards g as this policy allows, by bisection from above.
         reach, raised = g, None
         while raised is None and reach > at * (1 + 1e-13):
             reach = at + (reach - at) / 2
             raised = evaluate(lp, pair, reach, unit)
         if raised is None:
-            return Undecided(at)
+            return Undecided(pair, at)
         at, value = reach, raised
-    return Undecided(at)
+    return Undecided(pair, at)
 
 
 def refusal(lp: StabilizationLP, stop: Stop = lambda: False) -> Floats | None:

@@ -120,9 +120,7 @@ class Axis:
         if self.periodic:
             t = t - math.floor(t / self.cells) * self.cells
             images = [t - self.cells, t, t + self.cells]
-        return [
-            i for i in range(self.cells) if any(i - EDGE <= s <= i + 1 + EDGE for s in images)
-        ]
+        return [i for i in range(self.cells) if any(i - EDGE <= s <= i + 1 + EDGE for s in images)]
 
     def inside(self, a: float, b: float) -> list[int]:
         """The cells inside [a, b], up to EDGE widths."""
@@ -324,7 +322,12 @@ def stage_cost_function(problem: dict[str, Any]) -> Callable[[dict[str, float]],
     if system["kind"] == "standard_map":
         parameters = {"K": np.float64(0.25), **parameters}
     value = formula(problem["stage_cost"])
-    return lambda names: float(value({**parameters, **{k: np.float64(v) for k, v in names.items()}}))
+
+    def evaluate(names: dict[str, float]) -> float:
+        values = {k: np.float64(v) for k, v in names.items()}
+        return float(value({**parameters, **values}))
+
+    return evaluate
 
 
 def cell_of_image(axes: list[Axis], image: list[float], clip: bool) -> int | None:
@@ -342,7 +345,7 @@ def cell_of_image(axes: list[Axis], image: list[float], clip: bool) -> int | Non
     return flat(axes, index)
 
 
-# ----------------------------------------------------------------------------------------- the model
+# ---------------------------------------------------------------------------------------- the model
 
 Row = tuple[dict[int, Fraction], Fraction, Fraction]
 
@@ -449,7 +452,9 @@ def _shares(count: dict, weights: list[float], points: int) -> Row:
     """Turn counts per noise node into exact shares of the whole weight."""
     exact = [Fraction(w) for w in weights]
     whole = points * sum(exact)
-    share = {key: sum(n * w for n, w in zip(c, exact, strict=True)) / whole for key, c in count.items()}
+    share = {}
+    for key, numbers in count.items():
+        share[key] = sum(n * w for n, w in zip(numbers, exact, strict=True)) / whole
     absorbed = share.pop("absorbed", Fraction(0))
     escaped = share.pop("escaped", Fraction(0))
     return share, absorbed, escaped
@@ -592,6 +597,9 @@ def policy_value(
             right = G[at] + gamma * (P[at] @ V)  # V is still zero on the class itself
             if not right.any():
                 continue
+            if len(at) == 1:
+                V[at] = right / (1.0 - gamma * P[at, at])
+                continue
             inside = P[np.ix_(at, at)]
             matrix = np.eye(len(at)) - gamma * inside
             try:
@@ -643,7 +651,7 @@ def policy_iteration(
 
 
 def tree_policy(arrays: _Arrays) -> list[int]:
-    """Breadth-first levels from A: reaches A with positive probability, so surely, from all of C."""
+    """Breadth-first levels from A: from every cell of C the policy reaches A."""
     chosen: dict[int, int] = {}
     reached: set[int] = set()
     while len(chosen) < arrays.n:
@@ -687,7 +695,7 @@ def largest_gamma(P: np.ndarray, gamma: float) -> float:
     high = 2.0 * low
     while stabilizes(P, high, classes) is not None:
         low, high = high, 2.0 * high
-    while high - low > 1e-12 * low:
+    while high - low > 1e-11 * low:
         middle = 0.5 * (low + high)
         if stabilizes(P, middle, classes) is None:
             high = middle
@@ -718,7 +726,7 @@ def _gamma_bracket(arrays: _Arrays) -> tuple[float, float, list[int], Fraction]:
         gamma = best * (1 - 1e-9)
         _, other = policy_iteration(arrays, one, gamma, policy)
         reach = largest_gamma(arrays.P[other], gamma)
-        if reach <= best * (1 + 1e-11):
+        if reach <= best * (1 + 1e-10):
             break
         policy, best = other, reach
     low = best
@@ -742,9 +750,9 @@ def _proved_stabilizing(arrays: _Arrays, policy: list[int], gamma: float) -> boo
 
 
 def _unavoidable_growth(arrays: _Arrays, V: np.ndarray) -> Fraction:
-    """Return the largest lam found with P_a w >= lam w for all a, w = V on its largest entries, else 0.
+    """Return the largest lam found with P_a w >= lam w for all a: no policy has rho < lam.
 
-    Then no policy has a spectral radius below lam.
+    The candidates for w are V on its largest entries and 0 elsewhere.
     """
     best, best_w = 0.0, None
     order = np.argsort(-V)

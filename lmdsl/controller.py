@@ -1,0 +1,216 @@
+"""The feedback controller, and closed-loop simulation of the true map."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lmdsl.errors import BadInput
+from lmdsl.graph import CellStatus
+from lmdsl.partition import Partition
+from lmdsl.problem import Problem
+from lmdsl.sampling import noise_nodes
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+REACHED, LOST, CYCLING = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A feedback law that is constant on each cell.
+
+    Attributes
+    ----------
+    partition
+        The cells.
+    vectors
+        Control vectors, shape (M, p).
+    index
+        Control index of every cell, shape (N,), -1 where there is none.
+    """
+
+    partition: Partition
+    vectors: Floats
+    index: NDArray[np.int32]
+
+    def __call__(self, x: ArrayLike) -> Floats:
+        """Return the control at states.
+
+        Parameters
+        ----------
+        x
+            Shape (..., d), in the order of the axes; periodic axes wrap.
+
+        Returns
+        -------
+        ndarray, shape (..., p)
+            NaN where there is no control: off the stabilizable set, outside the box, and on the
+            attractor cells.
+        """
+        states = np.asarray(x, dtype=np.float64)
+        d = self.partition.dimension
+        if states.shape[-1:] != (d,):
+            raise BadInput(f"states have shape (..., {d}), not {states.shape}")
+        flat = states.reshape(-1, d)
+        cell = self.partition.locate(list(flat.T))
+        return self.at(cell).reshape(*states.shape[:-1], self.vectors.shape[1])
+
+    def at(self, cell: Indices) -> Floats:
+        """Return the control of cells, shape (len(cell), p); NaN for -1 and without control."""
+        index = np.where(cell >= 0, self.index[cell], -1)
+        return np.where(index[:, None] >= 0, self.vectors[index], np.nan)
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """Outcome of closed-loop runs of the true map from fresh random starts.
+
+    Attributes
+    ----------
+    starts
+        Number of runs; starts are drawn by m (a cell, then uniform inside).
+    reached, lost, cycling
+        Runs that entered A; that left the box, entered avoid or a cell without control; that did
+        neither within the step limit.
+    steps
+        ``min``, ``q50``, ``q90``, ``q99``, ``max`` of the steps of the reached; None if none.
+    interval
+        95 % Clopper-Pearson interval of the share reached.
+    """
+
+    starts: int
+    reached: int
+    lost: int
+    cycling: int
+    steps: dict[str, int] | None
+    interval: tuple[float, float]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        return {**asdict(self), "interval": list(self.interval)}
+
+
+class ClosedLoop:
+    """The true map under a controller: wraps, clips and judges like the compiled model."""
+
+    def __init__(
+        self, problem: Problem, controller: Controller, status: NDArray[np.uint8]
+    ) -> None:
+        self.problem, self.controller, self.status = problem, controller, status
+        self.partition = controller.partition
+        self.map = problem.step()
+        self.nodes = noise_nodes(problem)
+        self.probability = self.nodes.weights / self.nodes.weights.sum()
+
+    def step(self, x: Floats, cell: Indices, rng: np.random.Generator) -> tuple[Floats, Indices]:
+        """Return the next states, shape (r, d), and their cells, -1 outside the box."""
+        u = self.controller.at(cell)
+        values = {name: x[:, k] for k, name in enumerate(self.problem.states)}
+        values |= {name: u[:, k] for k, name in enumerate(self.problem.controls)}
+        if self.problem.noises:
+            node = rng.choice(len(self.probability), size=len(x), p=self.probability)
+            noise = self.nodes.values[node]
+            values |= {name: noise[:, k] for k, name in enumerate(self.problem.noises)}
+        images = [np.broadcast_to(image, len(x)) for image in self.map(values)]
+        return self._into_box(np.stack(images, axis=-1)), self.partition.locate(images)
+
+    def _into_box(self, x: Floats) -> Floats:
+        p = self.partition
+        with np.errstate(invalid="ignore"):
+            wrapped = p.low + np.mod(x - p.low, p.high - p.low)
+        inside = np.clip(x, p.low, p.high) if p.clip else x
+        return np.where(p.periodic, wrapped, inside)
+
+    def run(
+        self, x: Floats, steps: int, rng: np.random.Generator
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Run from states until A, loss, or the step limit; return outcome and steps per run."""
+        cell = self.partition.locate(list(x.T))
+        outcome = np.full(len(x), CYCLING, dtype=np.int64)
+        taken = np.full(len(x), steps, dtype=np.int64)
+        active = np.arange(len(x))
+        for n in range(steps + 1):
+            state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
+            for code, ended in (
+                (REACHED, state == CellStatus.ATTRACTOR),
+                (LOST, state > CellStatus.STABILIZED),
+            ):
+                outcome[active[ended]] = code
+                taken[active[ended]] = n
+            on = state == CellStatus.STABILIZED
+            active, x, cell = active[on], x[on], cell[on]
+            if n == steps or not len(active):
+                break
+            x, cell = self.step(x, cell, rng)
+        return outcome, taken
+
+    def path(self, x: ArrayLike, steps: int, seed: int = 0) -> Floats:
+        """Return the states of one run, shape (steps taken + 1, d), ending in A or with a loss."""
+        rng = np.random.default_rng(seed)
+        state = np.asarray(x, dtype=np.float64).reshape(1, -1)
+        states = [state[0]]
+        cell = self.partition.locate(list(state.T))
+        while len(states) <= steps and cell[0] >= 0 and self.status[cell[0]] == 1:
+            state, cell = self.step(state, cell, rng)
+            states.append(state[0])
+        return np.array(states)
+
+
+def draw_starts(
+    partition: Partition, cells: Indices, weight: Floats, count: int, rng: np.random.Generator
+) -> Floats:
+    """Draw states by m: a cell by its weight, then uniform inside, shape (count, d)."""
+    chosen = cells[rng.choice(len(cells), size=count, p=weight / weight.sum())]
+    index = np.stack(partition.multi_index(chosen), axis=-1)
+    return partition.low + (index + rng.random(index.shape)) * partition.width
+
+
+def simulate(
+    loop: ClosedLoop, cells: Indices, weight: Floats, starts: int, steps: int, seed: int
+) -> Simulation:
+    """Simulate closed-loop runs from random starts.
+
+    Parameters
+    ----------
+    loop
+        The true map under the controller.
+    cells, weight
+        The cells of C and m on them; starts are drawn by m.
+    starts, steps, seed
+        Number of runs, step limit, seed of starts and noise.
+    """
+    rng = np.random.default_rng(seed)
+    if not len(cells) or not weight.any():
+        raise BadInput("there is no stabilizable cell to start from")
+    x = draw_starts(loop.partition, cells, weight, starts, rng)
+    outcome, taken = loop.run(x, steps, rng)
+    reached = int((outcome == REACHED).sum())
+    quantiles = None
+    if reached:
+        q = np.quantile(
+            taken[outcome == REACHED], [0, 0.5, 0.9, 0.99, 1], method="inverted_cdf"
+        )
+        quantiles = dict(zip(("min", "q50", "q90", "q99", "max"), map(int, q), strict=True))
+    return Simulation(
+        starts=starts,
+        reached=reached,
+        lost=int((outcome == LOST).sum()),
+        cycling=int((outcome == CYCLING).sum()),
+        steps=quantiles,
+        interval=clopper_pearson(reached, starts),
+    )
+
+
+def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
+    """Return the exact two-sided confidence interval of a binomial probability."""
+    from scipy.special import betaincinv
+
+    tail = (1 - level) / 2
+    low = float(betaincinv(hits, trials - hits + 1, tail)) if hits else 0.0
+    high = float(betaincinv(hits + 1, trials - hits, 1 - tail)) if hits < trials else 1.0
+    return low, high

@@ -1,0 +1,225 @@
+"""What a solve returns: status, certificate, controller, and the arrays over all cells."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.certificate import Certificate
+from lmdsl.controller import ClosedLoop, Controller, Simulation, simulate
+from lmdsl.errors import BadInput
+from lmdsl.graph import CellStatus
+from lmdsl.partition import Partition
+from lmdsl.problem import Problem
+from lmdsl.transitions import Regions
+
+if TYPE_CHECKING:
+    import os
+
+    from lmdsl.lp import StabilizationLP
+
+EXIT = {"verified": 0, "unverified": 1, "bad_input": 2, "not_stabilizable": 3, "solver_failed": 4}
+ARRAYS = ("control_index", "value", "lower", "measure", "cell_status")
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Wall-clock seconds of the three stages."""
+
+    compile: float | None = None
+    solve: float | None = None
+    verify: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """The scalar part of a result: the keys of ``lmdsl solve --json``, in order.
+
+    Attributes
+    ----------
+    status
+        ``verified``, ``unverified``, ``not_stabilizable``, ``solver_failed``, ``bad_input``.
+    backend, solver_status
+        Who solved it, and the solver's own word.
+    gamma
+        Geometric weight of the cost.
+    cost, lower_bound, gap, tolerance
+        m'V_up, m'W, their relative difference, and the largest gap that counts as verified.
+    contraction
+        Proved bound on the spectral radius of max(gamma, 1) P_u.
+    gamma_bar
+        None or (low, high): proved bracket of the largest feasible gamma.
+    cells, controls, pairs
+        N, M and the number of surviving pairs.
+    attractor_cells, stabilizable_cells
+        Number of cells of A and C.
+    polish_steps
+        Improvement steps made on the backend's policy.
+    seconds
+        Wall-clock time per stage.
+    message
+        One sentence for people.
+    """
+
+    status: str
+    backend: str | None = None
+    solver_status: str | None = None
+    gamma: float | None = None
+    cost: float | None = None
+    lower_bound: float | None = None
+    gap: float | None = None
+    tolerance: float | None = None
+    contraction: float | None = None
+    gamma_bar: tuple[float, float] | None = None
+    cells: int | None = None
+    controls: int | None = None
+    pairs: int | None = None
+    attractor_cells: int | None = None
+    stabilizable_cells: int | None = None
+    polish_steps: int | None = None
+    seconds: Seconds = field(default_factory=Seconds)
+    message: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
+        return {f.name: jsonable(getattr(self, f.name)) for f in fields(Report)}
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the command line."""
+        return EXIT[self.status]
+
+
+def jsonable(value: Any) -> Any:
+    """Return plain data that strict JSON can hold."""
+    if isinstance(value, Seconds):
+        return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, tuple | list):
+        return [jsonable(v) for v in value]
+    if isinstance(value, dict):
+        return {k: jsonable(v) for k, v in value.items()}
+    if isinstance(value, float | np.floating):
+        number = float(value)
+        if math.isnan(number):
+            return None
+        return number if math.isfinite(number) else "inf" if number > 0 else "-inf"
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Result(Report):
+    """The answer to a problem; see :class:`Report` for the scalars.
+
+    Attributes
+    ----------
+    problem
+        The problem solved, overrides included.
+    certificate
+        The proved claims; ``certificate.verified`` and ``certificate.reasons``.
+    control_index
+        Shape (N,), int32: index into ``control_vectors``, -1 where there is none.
+    value, lower
+        Shape (N,): V_up and W, 0 on A, infinity off C (V_up also where not established).
+    measure
+        Shape (N,): the Lyapunov measure mu, 0 off C.
+    cell_status
+        Shape (N,), uint8: 0 attractor, 1 stabilized, 2 escapes, 3 trapped, 4 leads to these, 5
+        avoid.
+    witness
+        Shape (N,): w of claim 1, or of the refusal when not stabilizable; 0 elsewhere.
+    control_vectors
+        Shape (M, p).
+    iterations
+        Iterations in the backend's own sense.
+    gap_before_polish
+        Gap of the backend's own policy, None where nothing could be certified of it.
+    lp
+        The compiled model; None for a result read from a directory.
+    cause
+        Why it is not stabilizable: ``empty``, ``measure``, ``gamma`` or ``require_all``.
+    """
+
+    problem: Problem
+    partition: Partition
+    certificate: Certificate
+    control_index: NDArray[np.int32]
+    value: Floats
+    lower: Floats
+    measure: Floats
+    cell_status: NDArray[np.uint8]
+    witness: Floats
+    control_vectors: Floats
+    iterations: int | None = None
+    gap_before_polish: float | None = None
+    cause: str | None = None
+    lp: StabilizationLP | None = None
+
+    @property
+    def verified(self) -> bool:
+        """True when the certificate is complete and the gap within the tolerance."""
+        return self.certificate.verified
+
+    @cached_property
+    def controller(self) -> Controller:
+        """The feedback law, ``u = result.controller(x)``."""
+        return Controller(self.partition, self.control_vectors, self.control_index)
+
+    @cached_property
+    def closed_loop(self) -> ClosedLoop:
+        """The true map under the controller."""
+        return ClosedLoop(self.problem, self.controller, self.cell_status)
+
+    @cached_property
+    def weight(self) -> Floats:
+        """The user's m over all cells, shape (N,), sum 1 (all zero where none lies in C)."""
+        support = Regions.of(self.problem, self.partition).support
+        mass = support & (self.cell_status == CellStatus.STABILIZED)
+        weight: Floats = mass / max(int(mass.sum()), 1)
+        return weight
+
+    def simulate(self, starts: int = 10_000, steps: int = 10_000, seed: int = 0) -> Simulation:
+        """Run the true map under the controller from fresh random starts drawn by m.
+
+        Raises
+        ------
+        BadInput
+            There is no controller, or a count is not positive.
+        """
+        for name, count in (("starts", starts), ("steps", steps)):
+            if count < 1:
+                raise BadInput(f"{count} is not a positive number", name)
+        if (self.control_index < 0).all():
+            raise BadInput("there is no controller to simulate: " + self.message)
+        cells = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
+        weight = self.weight[cells]
+        return simulate(self.closed_loop, cells, weight, starts, steps, seed)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result as a directory that appears whole or not at all."""
+        from lmdsl.archive import save
+
+        save(self, path)
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Result:
+        """Read a result directory. Nothing is re-verified; see :func:`lmdsl.verify`."""
+        from lmdsl.archive import load
+
+        return load(path)
+
+    def __repr__(self) -> str:
+        parts = [f"status={self.status!r}", f"backend={self.backend!r}", f"gamma={self.gamma!r}"]
+        if self.cost is not None:
+            parts.append(f"cost={self.cost:.9g}")
+        if self.gap is not None:
+            parts.append(f"gap={self.gap:.2g}")
+        parts.append(f"{self.stabilizable_cells} of {self.cells} cells stabilized")
+        return f"Result({', '.join(parts)})"

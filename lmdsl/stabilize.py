@@ -1,0 +1,309 @@
+"""The pipeline: problem -> LP -> backend -> policy -> certificate -> result."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl import backends, bellman, certificate, policy
+from lmdsl.backends import Backend, Options, Solution, Stop
+from lmdsl.certificate import Certificate, Verified, Witness
+from lmdsl.errors import BadInput
+from lmdsl.graph import CellStatus
+from lmdsl.lp import StabilizationLP, compile
+from lmdsl.problem import Problem
+from lmdsl.result import Result, Seconds
+from lmdsl.transitions import Progress
+
+TOLERANCE = 1e-6
+Pairs = NDArray[np.int64]
+
+
+def solve(
+    problem: Problem | StabilizationLP,
+    backend: str | Backend = backends.DEFAULT,
+    *,
+    tolerance: float = TOLERANCE,
+    time_limit: float | None = None,
+    max_iterations: int | None = None,
+    require_all: bool = False,
+    progress: Progress | None = None,
+) -> Result:
+    """Solve a problem and verify the answer.
+
+    Parameters
+    ----------
+    problem
+        A problem, or the LP of :func:`lmdsl.compile`.
+    backend
+        ``"policy-iteration"``, ``"highs"``, ``"clarabel"``, ``"cvxpy"``, one of your own, each
+        optionally with an algorithm (``"highs:simplex"``, ``"cvxpy:SCS"``), or a Backend.
+    tolerance
+        Largest gap that counts as verified.
+    time_limit
+        Seconds for the backend.
+    max_iterations
+        Iterations in the backend's own sense.
+    require_all
+        Refuse a problem of which a cell outside A and Z is not stabilizable.
+    progress
+        Called with (stage, fraction done, or -1).
+
+    Returns
+    -------
+    Result
+        Also for unverified, not stabilizable and failed solves.
+
+    Raises
+    ------
+    BadInput
+        The problem or an option cannot be used.
+    """
+    _check_options(tolerance, time_limit, max_iterations)
+    chosen, algorithm = backends.resolve(backend)
+    started = time.perf_counter()
+    lp = compile(problem, progress) if isinstance(problem, Problem) else problem
+    compiled = time.perf_counter() - started if isinstance(problem, Problem) else None
+    job = _Job(lp, chosen, tolerance, compiled, backend if isinstance(backend, str) else None)
+    refused = _not_stabilizable(lp, require_all)
+    if refused:
+        return job.refused(*refused)
+    started = time.perf_counter()
+    deadline = None if time_limit is None else time.monotonic() + time_limit
+
+    def late() -> bool:
+        return deadline is not None and time.monotonic() > deadline
+
+    first = policy.stabilizing(lp, late)
+    if isinstance(first, policy.Refused):
+        verified = _refuse(lp, first, tolerance)
+        if verified.certificate.refusal:
+            job.solve_seconds = time.perf_counter() - started
+            message = (
+                f"gamma = {lp.gamma!r} is not below gamma_bar: proved that no control makes the "
+                f"cost finite from {int((verified.witness.w > 0).sum())} cells; "  # type: ignore[operator]
+                f"lower gamma (it works at {first.lower:.9g})"
+            )
+            bracket = (first.lower, lp.gamma)
+            return job.refused("gamma", message, verified, bracket)
+        first = policy.Undecided(first.pair, first.lower)
+    options = Options(
+        tolerance=tolerance,
+        time_limit=None if deadline is None else max(deadline - time.monotonic(), 1e-3),
+        max_iterations=max_iterations,
+        algorithm=algorithm,
+        start=first.pair,
+        progress=progress,
+    )
+    if isinstance(first, policy.Undecided):
+        word = "time limit" if late() else "gamma too close to its limit"
+        stop = Stop.TIME_LIMIT if late() else Stop.FAILED
+        solution = Solution(stop, word, pair=first.pair)
+    else:
+        if progress:
+            progress("solve", -1.0)
+        solution = chosen.solve(lp, options)
+    outcome = _polish(lp, solution, first.pair, tolerance)
+    job.solve_seconds = time.perf_counter() - started
+    if progress:
+        progress("verify", -1.0)
+    started = time.perf_counter()
+    verified = certificate.certify(lp, outcome.pair, tolerance, outcome.value)
+    job.verify_seconds = time.perf_counter() - started
+    undecided = isinstance(first, policy.Undecided) and not late()
+    return job.solved(solution, outcome, verified, undecided)
+
+
+def _check_options(
+    tolerance: float, time_limit: float | None, max_iterations: int | None
+) -> None:
+    if not 0 <= tolerance < np.inf:
+        raise BadInput(f"{tolerance!r} must be a finite number >= 0", "tolerance")
+    if time_limit is not None and not 0 < time_limit:
+        raise BadInput(f"{time_limit!r} must be a number of seconds > 0", "time_limit")
+    if max_iterations is not None and max_iterations < 1:
+        raise BadInput(f"{max_iterations!r} must be at least 1", "max_iterations")
+
+
+def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[str, str] | None:
+    """Return the cause and a sentence where the graph alone rules the problem out."""
+    if not lp.n:
+        return "empty", "no cell can be kept in the box and brought to the attractor"
+    if not lp.weight.any():
+        return "measure", "no cell of measure is stabilizable; enlarge its boxes"
+    outside = int((lp.cell_status >= CellStatus.ESCAPES).sum()) - int(
+        (lp.cell_status == CellStatus.AVOID).sum()
+    )
+    if require_all and outside:
+        return "require_all", f"{outside} cells outside A and Z are not stabilizable"
+    return None
+
+
+def _refuse(lp: StabilizationLP, found: policy.Refused, tolerance: float) -> Verified:
+    from lmdsl.bounds import lower_until_below
+
+    w = lower_until_below(lp, found.w, lp.gamma, None)
+    witness = Witness(None, found.w if w is None else w)
+    return Verified(certificate.check(lp, witness, tolerance), witness)
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """A policy after polishing, and what polishing did."""
+
+    pair: Pairs
+    value: NDArray[np.float64] | None
+    steps: int
+    gap_before: float | None
+
+
+def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
+    """Return the policy of a solution: its own, else greedy in V, else largest occupation."""
+    if solution.pair is not None:
+        return solution.pair
+    if solution.value is not None:
+        return bellman.improve(lp, np.maximum(solution.value, 0.0)).pair
+    if solution.occupation is not None:
+        theta = solution.occupation
+        top = np.maximum.reduceat(theta, lp.pair_pointer[:-1])
+        return policy.first_column(lp, theta >= top[lp.cell])
+    return None
+
+
+def _polish(
+    lp: StabilizationLP, solution: Solution, start: Pairs, tolerance: float
+) -> _Outcome:
+    """Improve a backend's policy exactly until nothing is strictly better, then break ties.
+
+    A policy that is not g-stabilizing is discarded where gamma >= 1. After a limit the policy is
+    left as it is: a limit is not a license to go on.
+    """
+    pair = _claimed(lp, solution)
+    value = None if pair is None else policy.evaluate(lp, pair, start=solution.value)
+    gap_before = None
+    if value is None or pair is None:
+        pair, value = start, policy.evaluate(lp, start)
+    if value is None or solution.stop.limit:
+        return _Outcome(pair, value, 0, None)
+    done = policy.iterate(lp, pair, value)
+    if done.steps:
+        gap_before = certificate.certify(lp, pair, tolerance, value).certificate.gap
+    tidy = policy.canonical(lp, done.pair, done.value)
+    if (tidy == done.pair).all():
+        return _Outcome(done.pair, done.value, done.steps, gap_before)
+    tidy_value = policy.evaluate(lp, tidy, start=done.value)
+    limit = (1 + tolerance / 4) * certificate.weighted(lp, done.value)
+    if tidy_value is None or certificate.weighted(lp, tidy_value) > limit:
+        return _Outcome(done.pair, done.value, done.steps, gap_before)
+    return _Outcome(tidy, tidy_value, done.steps, gap_before)
+
+
+class _Job:
+    """What is known before a result exists; makes the result."""
+
+    def __init__(
+        self,
+        lp: StabilizationLP,
+        backend: Backend,
+        tolerance: float,
+        compile_seconds: float | None,
+        spec: str | None,
+    ) -> None:
+        self.lp, self.tolerance, self.compile_seconds = lp, tolerance, compile_seconds
+        self.backend = spec or backend.name
+        self.solve_seconds: float | None = None
+        self.verify_seconds: float | None = None
+
+    def refused(
+        self,
+        cause: str,
+        message: str,
+        verified: Verified | None = None,
+        gamma_bar: tuple[float, float] | None = None,
+    ) -> Result:
+        if verified is None:
+            witness = Witness(None)
+            verified = Verified(certificate.check(self.lp, witness, self.tolerance), witness)
+        proof = replace(verified.certificate, reasons=(message,))
+        return self._result(
+            verified.witness, proof, "not_stabilizable", message, cause=cause, gamma_bar=gamma_bar
+        )
+
+    def solved(
+        self, solution: Solution, outcome: _Outcome, verified: Verified, undecided: bool
+    ) -> Result:
+        proof = verified.certificate
+        if proof.verified:
+            status = "verified"
+            message = (
+                f"the controller brings every one of {self.lp.n} cells to the attractor; "
+                f"its cost is within {proof.gap:.2g} of optimal (finite model)"
+            )
+        else:
+            failed = not solution.stop.success and not undecided
+            status = "solver_failed" if failed else "unverified"
+            message = "; ".join(proof.reasons)
+            if failed:
+                message = f"{solution.stop.value} ({solution.word}); {message}"
+            elif undecided:
+                message = (
+                    f"gamma = {self.lp.gamma!r} is so close to its limit that the numbers decide "
+                    f"neither way; {message}"
+                )
+        return self._result(
+            verified.witness,
+            proof,
+            status,
+            message,
+            solver_status=solution.word,
+            polish_steps=outcome.steps,
+            gap_before_polish=outcome.gap_before,
+            iterations=solution.iterations,
+        )
+
+    def _result(
+        self, witness: Witness, proof: Certificate, status: str, message: str, **more: Any
+    ) -> Result:
+        lp, n = self.lp, self.lp.n
+
+        def spread(values: Any, missing: float, attractor: float, outside: float) -> Any:
+            known = np.full(n, missing) if values is None else values
+            return lp.expand(np.asarray(known, dtype=np.float64), attractor, outside)
+
+        index = np.full(lp.partition.size, -1, dtype=np.int32)
+        if witness.pair is not None:
+            index[lp.cells] = lp.control[witness.pair]
+        solved = status != "not_stabilizable"
+        return Result(
+            status=status,
+            backend=self.backend,
+            gamma=lp.gamma,
+            cost=proof.cost if solved else None,
+            lower_bound=(proof.lower or 0.0) if solved else None,
+            gap=proof.gap if solved else None,
+            tolerance=self.tolerance,
+            contraction=proof.contraction,
+            cells=lp.partition.size,
+            controls=len(lp.controls),
+            pairs=lp.K,
+            attractor_cells=int((lp.cell_status == CellStatus.ATTRACTOR).sum()),
+            stabilizable_cells=n,
+            seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
+            message=message,
+            problem=lp.problem,
+            partition=lp.partition,
+            certificate=proof,
+            control_index=index,
+            value=spread(witness.V_up if proof.upper_bound else None, np.inf, 0.0, np.inf),
+            lower=spread(witness.W if proof.lower_bound else None, 0.0, 0.0, np.inf),
+            measure=spread(witness.mu, 0.0, 0.0, 0.0),
+            cell_status=lp.cell_status,
+            witness=spread(witness.w, 0.0, 0.0, 0.0),
+            control_vectors=lp.controls,
+            lp=lp,
+            **more,
+        )

@@ -1,0 +1,468 @@
+"""The reference itself: answers by hand, in closed form, by exact brute force, and by an LP."""
+
+import itertools
+import json
+import math
+from collections import Counter
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from random_problems import CORNER_CASES, describe, random_problem
+from reference import (
+    Axis,
+    ReferenceModel,
+    _Arrays,
+    _classify,
+    attractor_cells,
+    compile_reference,
+    control_vectors,
+    flat,
+    formula,
+    gamma_bracket,
+    next_state_function,
+    noise_nodes,
+    sample_offsets,
+    solve_reference,
+    unflat,
+)
+from scipy.optimize import linprog
+
+CASES = {problem["name"]: problem for problem in CORNER_CASES}
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Random problems and their models."""
+    problems = [random_problem(np.random.default_rng(seed)) for seed in range(60)]
+    return [(p, compile_reference(p)) for p in problems]
+
+
+def problem_of(text, cells, periodic=False, **more):
+    problem = {
+        "format": "lmdsl/1",
+        "system": {"kind": "map", "next": {"x": text}},
+        "state_box": {"x": {"low": 0, "high": 1, "cells": cells, "periodic": periodic}},
+        "attractor": {"cells": [[0]]},
+        "control_grid": {},
+        "stage_cost": "1",
+        "sampling": {"kind": "grid", "per_axis": 2},
+    }
+    return problem | more
+
+
+# ------------------------------------------------------------------------------------- closed forms
+
+
+@pytest.mark.parametrize("gamma", [0.25, 0.9, 1, 1.02, 3])
+@pytest.mark.parametrize("per_axis", [1, 2, 5])
+def test_a_shift_pays_once_a_step(gamma, per_axis):
+    control = {"u": {"low": 0, "high": 1, "points": 2}}
+    sampling = {"kind": "grid", "per_axis": per_axis}
+    problem = problem_of("x - 0.25*u", 4, control_grid=control, sampling=sampling, gamma=gamma)
+    solution = solve_reference(compile_reference(problem))
+    assert solution.status == "ok"
+    assert pytest.approx({1: 1, 2: 1 + gamma, 3: 1 + gamma + gamma**2}, rel=1e-14) == solution.V
+    assert solution.cost == pytest.approx((3 + 2 * gamma + gamma**2) / 3, rel=1e-14)
+    if gamma >= 1:
+        assert solution.policy == {1: 1, 2: 1, 3: 1}
+        assert solution.gamma_bar == (math.inf, math.inf)
+
+
+@pytest.mark.parametrize("gamma", [0.5, 1, 1.5, 1.99])
+@pytest.mark.parametrize("per_axis", [2, 6])
+def test_the_doubling_map_halves_what_is_left(gamma, per_axis):
+    sampling = {"kind": "grid", "per_axis": per_axis}
+    model = compile_reference(problem_of("2*x", 2, True, sampling=sampling))
+    assert model.rows == {(1, 0): ({1: Fraction(1, 2)}, Fraction(1, 2), Fraction(0))}
+    solution = solve_reference(model, gamma)
+    assert pytest.approx({1: 1 / (1 - gamma / 2)}, rel=1e-13) == solution.V
+    assert solution.gamma_bar == pytest.approx((2, 2), rel=1e-9)
+
+
+@pytest.mark.parametrize("gamma", [2, 2.5, 3])
+def test_the_doubling_map_from_gamma_two_on(gamma):
+    solution = solve_reference(compile_reference(problem_of("2*x", 2, True)), gamma)
+    assert (solution.status, solution.decided) == ("not_stabilizable", True)
+
+
+def test_one_step_of_runge_kutta():
+    system = {"kind": "ode", "derivative": {"x": "-a*x"}, "parameters": {"a": 2}, "step": 0.6}
+    for substeps in (1, 3):
+        image = next_state_function(problem_of("", 4, system=system | {"substeps": substeps}))
+        z = -2 * 0.6 / substeps
+        growth = 1 + z + z**2 / 2 + z**3 / 6 + z**4 / 24
+        assert image({"x": 0.7}) == pytest.approx([0.7 * growth**substeps], rel=1e-14)
+
+
+def test_hermite_nodes_have_the_moments_of_the_normal():
+    nodes = noise_nodes({"noise": {"w": {"normal": {"std": 0.3, "points": 5}}}})
+    moments = [math.fsum(p * v**k for (v,), p in nodes) for k in range(7)]
+    assert moments == pytest.approx([1, 0, 0.09, 0, 3 * 0.3**4, 0, 15 * 0.3**6], abs=1e-15)
+
+
+def test_one_recurrent_class_of_growth_nine_tenths_and_one_of_three_tenths():
+    """Cell 1 stays with 0.9, cell 2 with 0.3, both else go to A: gamma_bar is 10/9."""
+    noise = {"w": {"values": list(range(10)), "weights": [0.1] * 10}}
+    text = "where(x < 0.66, where(w < 9, x, 0.1), where(w < 3, x, 0.1))"
+    model = compile_reference(problem_of(text, 3, noise=noise))
+    low, high, _, _ = gamma_bracket(model)
+    assert low <= 10 / 9 * (1 + 1e-15)
+    assert (low, high) == pytest.approx((10 / 9, 10 / 9), rel=1e-8)
+    assert pytest.approx({1: 1 / 0.01, 2: 1 / 0.67}, rel=1e-12) == solve_reference(model, 1.1).V
+
+
+def test_a_chain_of_classes_of_equal_growth():
+    """Cell k stays with 1/2 and else goes to k - 1: V_k = (1 + gamma V_(k-1) / 2) / (1 - gamma/2)."""
+    noise = {"w": {"values": [0, 1], "weights": [0.5, 0.5]}}
+    model = compile_reference(problem_of("x - w/8", 8, noise=noise))
+    assert solve_reference(model).gamma_bar == pytest.approx((2, 2), rel=1e-6)
+    V, gamma = 0.0, 1.9
+    expected = {k: (V := (1 + gamma * V / 2) / (1 - gamma / 2)) for k in range(1, 8)}
+    assert pytest.approx(expected, rel=1e-12) == solve_reference(model, gamma).V
+
+
+# --------------------------------------------------------------------------------- the parts, by hand
+
+
+def test_cells_of_images():
+    axis = Axis("x", -1.0, 3.0, 4, False)
+    given = [-1, -1 - 5e-10, -1 - 2e-9, 0, -2e-9, -5e-10, 3, 3 + 5e-10, 3 + 2e-9, 2.5, 1e300]
+    assert [axis.cell_of(v) for v in given] == [0, 0, None, 1, 0, 1, 3, 3, None, 3, None]
+    turn = Axis("x", -1.0, 3.0, 4, True)
+    given = [-1, 3, -1 - 5e-10, -1 - 2e-9, 3 - 5e-10, 0.5 + 4e6, 0.5 - 4e6]
+    assert [turn.cell_of(v) for v in given] == [0, 0, 0, 3, 0, 1, 1]
+    assert axis.cell_of(math.nan) is None
+    assert turn.cell_of(math.inf) is None
+
+
+def test_cells_of_points_and_boxes():
+    axis = Axis("x", -1.0, 3.0, 4, False)
+    given = [-1, 0, 0.5, 1 + 5e-10, 1 + 2e-9, 3]
+    assert [axis.touched_by(v) for v in given] == [[0], [0, 1], [1], [1, 2], [2], [3]]
+    turn = Axis("x", -1.0, 3.0, 4, True)
+    assert [turn.touched_by(v) for v in (-1, 3, 7, 0.5)] == [[0, 3], [0, 3], [0, 3], [1]]
+    assert Axis("x", 0.0, 1.0, 1, True).touched_by(0) == [0]
+    assert axis.inside(-1, 1) == axis.inside(-1 + 5e-10, 1.9) == [0, 1]
+    assert axis.inside(-1 + 2e-9, 1) == [1]
+    assert axis.overlapped(0.5, 1 + 5e-10) == [1]
+    assert axis.overlapped(0.5, 1 + 2e-9) == [1, 2]
+
+
+def test_orders_are_c_order():
+    axes = [Axis("b", 0, 1, 2, False), Axis("a", 0, 1, 3, False), Axis("c", 0, 1, 4, False)]
+    indices = list(itertools.product(range(2), range(3), range(4)))
+    assert [unflat(axes, k) for k in range(24)] == indices
+    assert [flat(axes, i) for i in indices] == list(range(24))
+    grid = {"v": {"values": [2, -1]}, "u": {"low": 0, "high": 1, "points": 3}}
+    vectors = control_vectors({"control_grid": grid})
+    assert vectors == [(2, 0), (2, 0.5), (2, 1), (-1, 0), (-1, 0.5), (-1, 1)]
+    assert control_vectors({"control_grid": {}}) == [()]
+    noise = {n: {"values": [1, 2, 3], "weights": [0.5, 0, 0.5]} for n in "ab"}
+    assert noise_nodes({"noise": noise}) == [((i, j), 0.25) for i in (1, 3) for j in (1, 3)]
+    problem = {"state_box": {"x": {}, "y": {}}, "sampling": {"kind": "grid", "per_axis": 2}}
+    assert sample_offsets(problem) == [(0.25, 0.25), (0.25, 0.75), (0.75, 0.25), (0.75, 0.75)]
+
+
+def test_the_orbit_of_the_paper_touches_two_cells_a_point():
+    axis = {"low": 0, "high": 1, "cells": 50, "periodic": True}
+    points = [{"x": 0.25, "y": 0.5}, {"x": 0.75, "y": 0.5}]
+    problem = {"state_box": {"x": axis, "y": axis}, "attractor": {"points": points}}
+    assert attractor_cells(problem) == {12 * 50 + 24, 12 * 50 + 25, 37 * 50 + 24, 37 * 50 + 25}
+
+
+def test_formulas_are_float64():
+    names = {"x": np.float64(-2.0)}
+    cases = {"x**2": 4.0, "-x**2": -4.0, "2**-1": 0.5, "7/2": 3.5, "1/(x + 2)": math.inf}
+    cases |= {"where(x < 0, 1, 2)": 1.0, "min(x, 3) + max(x, 3)": 1.0, "atan2(0, x)": math.pi}
+    for text, value in cases.items():
+        assert formula(text)(names) == value
+    for text in ("x**0.5", "sqrt(x)", "log(x)", "min(sqrt(x), 1)", "0/(x + 2)"):
+        assert math.isnan(formula(text)(names))
+
+
+# -------------------------------------------------------------------------------------- corner cases
+
+# name: cell_status, V (None: not stabilizable)
+BY_HAND = {
+    "shift": ([0, 1, 1, 1], {1: 1, 2: 2.5, 3: 4.75}),
+    "point on an edge": ([0, 0, 1, 1], {2: 1, 3: 2}),
+    "point at high": ([1, 1, 1, 0], {0: 3, 1: 2, 2: 1}),
+    "point near an edge": ([0, 0, 1, 1], {2: 1, 3: 2}),
+    "point not near an edge": ([3, 0, 1, 1], {2: 1, 3: 2}),
+    "point on the seam": ([0, 1, 1, 0], {1: 1, 2: 2}),
+    "point on a corner": (
+        [3, 0, 0, 3, 3, 0, 0, 3, 3, 1, 1, 3, 3, 1, 1, 3],
+        {9: 1, 10: 1, 13: 2, 14: 2},
+    ),
+    "box that nearly holds two cells": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 3}),
+    "image on an edge": ([0, 3, 3, 3], None),
+    "image at high": ([1, 1, 1, 0], {0: 3, 1: 2, 2: 1}),
+    "image at low": ([3, 3, 3, 0], None),
+    "images around edges": ([0, 1, 1, 3], {1: 1, 2: 1}),
+    "one-cell axis": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 3}),
+    "everything escapes": ([0, 2, 2, 2], None),
+    "everything trapped": ([0, 3, 3, 3], None),
+    "leads to these": ([0, 4, 4, 2, 4], None),
+    "the risky shortcut does not survive": ([0, 1, 1, 3], {1: 1, 2: 2}),
+    "half of it is trapped": ([0, 4, 4, 3], None),
+    "values not sorted": ([0, 1, 1, 1], {1: 1, 2: 1, 3: 2}),
+    "zero weight is dropped": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 3}),
+    "small weight counts": ([0, 2, 2, 2], None),
+    "weights that are not dyadic": ([0, 0, 1, 1], {2: 1 / 0.9, 3: (1 + 0.2 / 0.9) / 0.9}),
+    "clip": ([0, 1, 1, 1], {1: 1, 2: 1, 3: 1}),
+    "clip with avoid": ([0, 1, 1, 5], {1: 1, 2: 2}),
+    "avoid touches without overlap": ([0, 1, 5, 3], {1: 1}),
+    "clip does not save an infinite image": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 1}),
+    "many turns": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 3}),
+    "NaN for some controls": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 3}),
+    "doubling map, gamma 0.5": ([0, 1], {1: 4 / 3}),
+    "doubling map, gamma 1": ([0, 1], {1: 2}),
+    "doubling map, gamma 1.5": ([0, 1], {1: 4}),
+    "doubling map, gamma 2": ([0, 1], None),
+    "doubling map, gamma 3": ([0, 1], None),
+    "stay for free": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 3}),
+    "stay for free, discounted": ([0, 1, 1, 1], {1: 0, 2: 0, 3: 0}),
+    "stay for free, growing": ([0, 1, 1, 1], {1: 1, 2: 2.25, 3: 3.8125}),
+    "all is free": ([0, 1, 1, 1], {1: 0, 2: 0, 3: 0}),
+    "measure outside C": ([0, 1, 1, 3], None),
+    "measure on one cell": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 3}),
+}
+
+
+def test_every_corner_case_has_an_answer():
+    assert set(CASES) == set(BY_HAND)
+    assert len(CASES) == len(CORNER_CASES)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_corner_case(name):
+    status, V = BY_HAND[name]
+    model = compile_reference(CASES[name])
+    solution = solve_reference(model)
+    assert model.cell_status == status
+    assert solution.status == ("not_stabilizable" if V is None else "ok")
+    assert solution.decided
+    assert pytest.approx(V or {}, rel=1e-12) == solution.V
+
+
+def test_corner_cases_in_detail():
+    model = compile_reference(CASES["images around edges"])
+    assert {p for p in model.rows if p not in model.admissible} == {(2, 3), (3, 2)}
+    assert [model.rows[1, u][1] for u in range(4)] == [0, 0, 1, 0]
+    assert [model.rows[2, u][1] for u in range(4)] == [1, 1, 1, 0]
+    model = compile_reference(CASES["NaN for some controls"])
+    assert {p for p in model.rows if p not in model.admissible} == {(1, 0), (2, 0), (3, 0)}
+    model = compile_reference(CASES["small weight counts"])
+    assert 0 < model.rows[3, 0][2] < Fraction(1, 10**11)
+    model = compile_reference(CASES["zero weight is dropped"])
+    assert (model.S, model.points) == (1, 1)
+    model = compile_reference(CASES["the risky shortcut does not survive"])
+    assert (2, 1) in model.admissible
+    assert (2, 1) not in model.surviving
+    solution = solve_reference(compile_reference(CASES["measure on one cell"]))
+    assert solution.cost == 2
+    solution = solve_reference(compile_reference(CASES["stay for free, discounted"]))
+    assert not solution.tied_policy_reaches
+    solution = solve_reference(compile_reference(CASES["values not sorted"]))
+    assert solution.ties == {1: {2}, 2: {0}, 3: {0, 2}}
+
+
+# ---------------------------------------------------------------------------------- random problems
+
+
+def test_random_problems_are_reproducible_and_json():
+    for seed in range(5):
+        one, two = (random_problem(np.random.default_rng(seed)) for _ in range(2))
+        assert json.dumps(one, allow_nan=False) == json.dumps(two, allow_nan=False)
+
+
+def test_random_problems_vary(drawn):
+    seen = Counter()
+    for problem, model in drawn:
+        assert model.N <= 200
+        assert model.M <= 6
+        assert model.S <= 20
+        seen.update(k for k in ("avoid", "noise", "measure", "gamma") if k in problem)
+        seen.update(problem["attractor"].keys())
+        seen[problem["system"]["kind"]] += 1
+        seen[problem["sampling"]["kind"]] += 1
+        seen[problem.get("on_exit", "forbid")] += 1
+        seen[f"d={len(model.axes)} p={len(problem['control_grid'])}"] += 1
+        seen.update({f"status {s}" for s in model.cell_status})
+        seen["C"] += bool(model.C)
+        solution = solve_reference(model)
+        seen[solution.status] += 1
+        gamma = problem.get("gamma", 1)
+        seen["gamma < 1" if gamma < 1 else "gamma = 1" if gamma == 1 else "gamma > 1"] += 1
+        seen["at gamma_bar"] += bool(model.C) and 1 < solution.gamma_bar[0] <= gamma
+    assert seen["C"] >= len(drawn) / 2
+    expected = ["avoid", "noise", "measure", "gamma", "points", "boxes", "cells", "map", "ode"]
+    expected += ["grid", "random", "sobol", "clip", "forbid", "ok", "not_stabilizable"]
+    expected += ["gamma < 1", "gamma = 1", "gamma > 1", "at gamma_bar"]
+    expected += [f"status {k}" for k in range(6)]
+    assert [k for k in expected if seen[k] < 3] == []
+
+
+def test_rows_sum_to_exactly_one(drawn):
+    for problem, model in drawn + [(p, compile_reference(p)) for p in CORNER_CASES]:
+        for pair, (targets, absorbed, escaped) in model.rows.items():
+            assert sum(targets.values()) + absorbed + escaped == 1, describe(problem)
+            assert (pair in model.admissible) == (escaped == 0)
+            counts = model.counts[pair].values()
+            assert [sum(c) for c in zip(*counts, strict=True)] == [model.points] * len(model.noise)
+        for cell, control in model.surviving:
+            targets, absorbed, _ = model.rows[cell, control]
+            assert all(model.cell_status[t] == 1 for t in targets)
+            assert sum(targets.values()) + absorbed == 1
+        assert sum(model.m.values()) == pytest.approx(1 if model.m else 0)
+
+
+def test_values_satisfy_the_optimality_equation(drawn):
+    for problem, model in drawn:
+        solution = solve_reference(model)
+        assert solution.decided, describe(problem)
+        for cell, V in solution.V.items():
+            Q = {}
+            for c, u in model.surviving:
+                if c == cell:
+                    row = model.rows[c, u][0]
+                    mean = math.fsum(float(p) * solution.V[t] for t, p in row.items())
+                    Q[u] = model.cost[c, u] + solution.gamma * mean
+            assert min(Q.values()) == pytest.approx(V, rel=1e-11)
+            assert Q[solution.policy[cell]] == pytest.approx(V, rel=1e-11)
+
+
+def test_a_linear_program_finds_the_same_cost(drawn):
+    """Max sum of V s.t. V <= gamma P V + G; unbounded or infeasible in the dual beyond gamma_bar."""
+    for problem, model in drawn:
+        solution = solve_reference(model)
+        if solution.status != "ok" or max(solution.V.values()) > 1e4:
+            continue
+        a = _Arrays(model)
+        E = np.zeros((a.K, a.n))
+        for k, (cell, _) in enumerate(a.pairs):
+            E[k, a.index[cell]] = 1.0
+        lp = linprog(-np.ones(a.n), A_ub=E - solution.gamma * a.P, b_ub=a.G, bounds=(None, None))
+        assert lp.status == 0, describe(problem)
+        assert -lp.fun == pytest.approx(sum(solution.V.values()), rel=1e-5, abs=1e-5)
+
+
+# ---------------------------------------------------------------------- exact brute force, tiny models
+
+
+def tiny_model(rng):
+    """A finite model drawn directly: up to four cells outside A, up to three controls."""
+    n, M = int(rng.integers(1, 5)), int(rng.integers(1, 4))
+    model = ReferenceModel(
+        problem={"gamma": 1.0},
+        axes=[Axis("x", 0.0, 1.0, n + 1, False)],
+        controls=[(float(u),) for u in range(M)],
+        N=n + 1,
+        M=M,
+        S=4,
+        points=4,
+        noise=[((), 1.0)],
+        attractor={0},
+        avoid=set(),
+        counts={},
+        rows={},
+        admissible=set(),
+        cost={},
+    )
+    for pair in itertools.product(range(1, n + 1), range(M)):
+        landed = Counter(int(t) for t in rng.integers(-1, n + 1, 4 if rng.random() < 0.6 else 1))
+        if rng.random() < 0.7:
+            landed.pop(-1, None)
+        if not landed:
+            landed[0] = 1
+        share = {t: Fraction(k, sum(landed.values())) for t, k in landed.items()}
+        absorbed, escaped = share.pop(0, Fraction(0)), share.pop(-1, Fraction(0))
+        model.rows[pair] = share, absorbed, escaped
+        if escaped == 0:
+            model.admissible.add(pair)
+            model.cost[pair] = float(rng.choice([0, 0, 1, 2, 0.375]))
+    _classify(model)
+    return model
+
+
+def solve_exactly(matrix, right):
+    """Gauss-Jordan with fractions; None if singular."""
+    n = len(right)
+    rows = [[*row, r] for row, r in zip(matrix, right, strict=True)]
+    for i in range(n):
+        pivot = next((j for j in range(i, n) if rows[j][i] != 0), None)
+        if pivot is None:
+            return None
+        rows[i], rows[pivot] = rows[pivot], rows[i]
+        rows[i] = [v / rows[i][i] for v in rows[i]]
+        for j in range(n):
+            if j != i and rows[j][i] != 0:
+                factor = rows[j][i]
+                rows[j] = [v - factor * p for v, p in zip(rows[j], rows[i], strict=True)]
+    return [row[n] for row in rows]
+
+
+def brute_force(model, gamma):
+    """Least value of every cell over all stabilizing policies, None if there is none."""
+    C, gamma = model.C, Fraction(gamma)
+    choices = [[p for p in model.surviving if p[0] == cell] for cell in C]
+    values = []
+    for policy in itertools.product(*choices):
+        matrix = [
+            [Fraction(i == j) - gamma * model.rows[p][0].get(j, Fraction(0)) for j in C]
+            for i, p in zip(C, policy, strict=True)
+        ]
+        w = solve_exactly(matrix, [Fraction(1)] * len(C))
+        if w is not None and all(v > 0 for v in w):  # w = gamma P w + 1, w > 0
+            values.append(solve_exactly(matrix, [Fraction(model.cost[p]) for p in policy]))
+    if not values:
+        return None
+    least = [min(v[i] for v in values) for i in range(len(C))]
+    assert least in values  # one policy is best everywhere
+    return {c: float(v) for c, v in zip(C, least, strict=True)}
+
+
+def exact_stabilizable_set(model):
+    """Cells outside A from which some policy reaches A surely and never escapes, by enumeration."""
+    cells = range(1, model.N)
+    found = set()
+    for policy in itertools.product(range(model.M), repeat=model.N - 1):
+        rows = {c: model.rows[c, u] for c, u in zip(cells, policy, strict=True)}
+        bad = {c for c in cells if rows[c][2] > 0}
+        for _ in cells:
+            bad |= {c for c in cells if any(t in bad for t in rows[c][0])}
+        good = set(cells) - bad
+        reach = set()
+        for _ in cells:
+            reach |= {c for c in good if rows[c][1] > 0 or any(t in reach for t in rows[c][0])}
+        lost = good - reach
+        for _ in cells:
+            lost |= {c for c in good if any(t in lost for t in rows[c][0])}
+        found |= good - lost
+    return found
+
+
+def test_brute_force_agrees():
+    rng = np.random.default_rng(7)
+    seen = Counter()
+    for _ in range(150):
+        model = tiny_model(rng)
+        assert set(model.C) == exact_stabilizable_set(model)
+        for gamma in (0.75, 1.0, 1.25, 2.0, 4.0):
+            if not model.C:
+                assert solve_reference(model, gamma).status == "not_stabilizable"
+                continue
+            solution, exact = solve_reference(model, gamma), brute_force(model, gamma)
+            seen[gamma, solution.status] += 1
+            low, high = solution.gamma_bar
+            if low < gamma < high:
+                assert high <= low * (1 + 1e-6)
+                seen["undecided"] += 1
+                continue
+            assert (solution.status == "ok") == (exact is not None)
+            assert pytest.approx(exact or {}, rel=1e-11) == solution.V
+    assert seen["undecided"] <= 5
+    for gamma in (1.25, 2.0, 4.0):
+        assert seen[gamma, "ok"] >= 10
+        assert seen[gamma, "not_stabilizable"] >= (1 if gamma == 1.25 else 10)
