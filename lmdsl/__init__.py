@@ -10,8 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lmdsl import backends as backends
+    from lmdsl import plotting as plotting
     from lmdsl import systems as systems
     from lmdsl.certificate import Certificate as Certificate
+    from lmdsl.comparison import Comparison as Comparison
+    from lmdsl.comparison import compare as compare
     from lmdsl.controller import Controller as Controller
     from lmdsl.controller import Simulation as Simulation
     from lmdsl.errors import BadInput as BadInput
@@ -23,6 +26,8 @@ if TYPE_CHECKING:
     from lmdsl.problem import load as load
     from lmdsl.result import Result as Result
     from lmdsl.stabilize import solve as solve
+    from lmdsl.verification import Verification as Verification
+    from lmdsl.verification import verify as verify
 
 __version__ = "0.1.0"
 
@@ -30,17 +35,21 @@ _HOME = {
     "BadInput": "errors",
     "CellStatus": "graph",
     "Certificate": "certificate",
+    "Comparison": "comparison",
     "Controller": "controller",
     "LmdslError": "errors",
     "Problem": "problem",
     "Result": "result",
     "Simulation": "controller",
     "StabilizationLP": "lp",
+    "Verification": "verification",
+    "compare": "comparison",
     "compile": "lp",
     "load": "problem",
     "solve": "stabilize",
+    "verify": "verification",
 }
-_MODULES = ("backends", "systems")
+_MODULES = ("backends", "plotting", "systems")
 
 __all__ = ["__version__", *_HOME, *_MODULES]
 

@@ -81,17 +81,20 @@ def _open_regular(path: str, flags: int) -> int:
     return descriptor
 
 
-def read_json(path: Path) -> Any:
-    """Read strict JSON: UTF-8, no duplicate key, no null, NaN or infinity, bounded nesting."""
+def read_json(path: Path, null: bool = False) -> Any:
+    """Read strict JSON: UTF-8, no duplicate key, NaN or infinity, bounded nesting.
+
+    Null is refused unless ``null`` is True.
+    """
     try:
-        return strict_json(read_bytes(path))
+        return strict_json(read_bytes(path), null)
     except BadInput as error:
         if error.where or error.message.startswith("cannot read"):
             raise
         raise BadInput(f"{shown(str(path), 200)}: {error.message}") from None
 
 
-def strict_json(content: bytes) -> Any:
+def strict_json(content: bytes, null: bool = False) -> Any:
     """Parse strict JSON; the first fault is raised as BadInput with its path."""
     try:
         text = content.decode("utf-8-sig")
@@ -110,7 +113,7 @@ def strict_json(content: bytes) -> Any:
         ) from None
     except RecursionError:
         raise BadInput(f"nested deeper than {MAX_NESTING} levels") from None
-    _refuse_faults(data, "")
+    _refuse_faults(data, "", null)
     return data
 
 
@@ -131,12 +134,12 @@ def _object(pairs: list[tuple[str, Any]]) -> Any:
     return found
 
 
-def _refuse_faults(data: Any, where: str, depth: int = 0) -> None:
+def _refuse_faults(data: Any, where: str, null: bool, depth: int = 0) -> None:
     if depth > MAX_NESTING:
         raise BadInput(f"nested deeper than {MAX_NESTING} levels")
     if isinstance(data, _Fault):
         raise BadInput(data.message, where)
-    if data is None:
+    if data is None and not null:
         raise BadInput("null is not a value of the format; leave the key out", where)
     if isinstance(data, str):
         _refuse_surrogates(data, where)
@@ -144,11 +147,11 @@ def _refuse_faults(data: Any, where: str, depth: int = 0) -> None:
         for key, value in data.items():
             _refuse_surrogates(key, where)
             name = key if key.isascii() and key.isidentifier() else shown(key)
-            _refuse_faults(value, joined(where, name), depth + 1)
+            _refuse_faults(value, joined(where, name), null, depth + 1)
     elif isinstance(data, list):
         for i, value in enumerate(data):
             if type(value) is not float and type(value) is not int:
-                _refuse_faults(value, joined(where, f"[{i}]"), depth + 1)
+                _refuse_faults(value, joined(where, f"[{i}]"), null, depth + 1)
 
 
 def _refuse_surrogates(text: str, where: str) -> None:

@@ -395,6 +395,10 @@ class Problem(Declared):
             if not a < b:
                 raise BadInput(f"[{a!r}, {b!r}] is empty; write [a, b] with a < b", f"{where}.{name}")
 
+    def replaced(self, **changes: Any) -> Problem:
+        """Return a copy with some keys changed, validated anew."""
+        return Problem(**{**{key: getattr(self, key) for key in Problem.model_fields}, **changes})
+
     def to_dict(self) -> dict[str, Any]:
         """Return the problem as plain data that ``json.dumps`` accepts, defaults written out."""
         if isinstance(self.system, FunctionSystem):

@@ -143,6 +143,8 @@ class Result(Report):
         Gap of the backend's own policy, None where nothing could be certified of it.
     lp
         The compiled model; None for a result read from a directory.
+    model_sha256
+        Digest of the compiled model, as read from a directory.
     cause
         Why it is not stabilizable: ``empty``, ``measure``, ``gamma`` or ``require_all``.
     """
@@ -161,6 +163,7 @@ class Result(Report):
     gap_before_polish: float | None = None
     cause: str | None = None
     lp: StabilizationLP | None = None
+    model_sha256: str = ""
 
     @property
     def verified(self) -> bool:

@@ -328,19 +328,19 @@ def _boxes(rng: np.random.Generator, problem: Problem, size: float) -> list[Prob
 
 def _gamma(rng: np.random.Generator, problem: Problem) -> float | None:
     kind = rng.random()
-    if kind < 0.15:
+    if kind < 0.12:
         return None  # the default
-    if kind < 0.3:
+    if kind < 0.24:
         return 1.0 if rng.random() < 0.7 else 1
-    if kind < 0.5:
+    if kind < 0.4:
         return _number(rng, 0.5, 0.999)
-    if kind < 0.65:
+    if kind < 0.5:
         return _number(rng, 1.001, 1.1)
     bracket = gamma_bracket(compile_reference(problem))
     bar = bracket[0] if bracket else 2.0
     if bar > 20:
         return _number(rng, 1.0, 3.0)
-    factor = float(rng.choice([0.5, 0.9, 0.99, 0.999, 1.001, 1.05, 1.5]))
+    factor = float(rng.choice([0.5, 0.9, 0.99, 0.999, 1.001, 1.01, 1.1, 1.5]))
     gamma = 1 + (bar - 1) * factor if factor < 1 else bar * factor
     return float(f"{gamma:.9g}")
 

@@ -34,7 +34,7 @@ CASES = {problem["name"]: problem for problem in CORNER_CASES}
 @pytest.fixture(scope="module")
 def drawn():
     """Random problems and their models."""
-    problems = [random_problem(np.random.default_rng(seed)) for seed in range(60)]
+    problems = [random_problem(np.random.default_rng(seed)) for seed in range(50)]
     return [(p, compile_reference(p)) for p in problems]
 
 
@@ -113,7 +113,7 @@ def test_one_recurrent_class_of_growth_nine_tenths_and_one_of_three_tenths():
 
 
 def test_a_chain_of_classes_of_equal_growth():
-    """Cell k stays with 1/2 and else goes to k - 1: V_k = (1 + gamma V_(k-1) / 2) / (1 - gamma/2)."""
+    """Cell k stays with 1/2, else goes to k - 1: V_k = (1 + gamma V_(k-1)/2) / (1 - gamma/2)."""
     noise = {"w": {"values": [0, 1], "weights": [0.5, 0.5]}}
     model = compile_reference(problem_of("x - w/8", 8, noise=noise))
     assert solve_reference(model).gamma_bar == pytest.approx((2, 2), rel=1e-6)
@@ -122,7 +122,7 @@ def test_a_chain_of_classes_of_equal_growth():
     assert pytest.approx(expected, rel=1e-12) == solve_reference(model, gamma).V
 
 
-# --------------------------------------------------------------------------------- the parts, by hand
+# ------------------------------------------------------------------------------- the parts, by hand
 
 
 def test_cells_of_images():
@@ -181,7 +181,7 @@ def test_formulas_are_float64():
         assert math.isnan(formula(text)(names))
 
 
-# -------------------------------------------------------------------------------------- corner cases
+# ------------------------------------------------------------------------------------ corner cases
 
 # name: cell_status, V (None: not stabilizable)
 BY_HAND = {
@@ -334,7 +334,7 @@ def test_values_satisfy_the_optimality_equation(drawn):
 
 
 def test_a_linear_program_finds_the_same_cost(drawn):
-    """Max sum of V s.t. V <= gamma P V + G; unbounded or infeasible in the dual beyond gamma_bar."""
+    """Max sum of V s.t. V <= gamma P V + G, by HiGHS."""
     for problem, model in drawn:
         solution = solve_reference(model)
         if solution.status != "ok" or max(solution.V.values()) > 1e4:
@@ -348,7 +348,7 @@ def test_a_linear_program_finds_the_same_cost(drawn):
         assert -lp.fun == pytest.approx(sum(solution.V.values()), rel=1e-5, abs=1e-5)
 
 
-# ---------------------------------------------------------------------- exact brute force, tiny models
+# -------------------------------------------------------------------- exact brute force, tiny models
 
 
 def tiny_model(rng):
@@ -446,7 +446,7 @@ def exact_stabilizable_set(model):
 def test_brute_force_agrees():
     rng = np.random.default_rng(7)
     seen = Counter()
-    for _ in range(150):
+    for _ in range(100):
         model = tiny_model(rng)
         assert set(model.C) == exact_stabilizable_set(model)
         for gamma in (0.75, 1.0, 1.25, 2.0, 4.0):

@@ -1,0 +1,92 @@
+"""The LP as foreign solvers see it: numbers near one, and the way back.
+
+min c'x  s.t.  A x = b, x >= 0  with c = G / max G and b = m / max m. Solvers test absolute
+tolerances; costs of 1e-9 or 1e9, or a million cells of weight 1e-6, must not decide what passes.
+Back: V = max G * y with y the multiplier of A x = b, and theta = max m * x.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.backends.base import Solution, Stop
+from lmdsl.lp import StabilizationLP
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ScaledLP:
+    """The scaled LP; its arrays are copies, so that no solver can touch the model's.
+
+    Attributes
+    ----------
+    A
+        (E - gamma P)', SciPy CSC, shape (n, K).
+    b, c
+        Right-hand side, shape (n,), and cost, shape (K,); largest entry 1, or all zero.
+    b_unit, c_unit
+        What 1 stands for in b and in c.
+    started
+        When work on it began.
+    """
+
+    A: Any
+    b: Floats
+    c: Floats
+    b_unit: float
+    c_unit: float
+    started: float = field(default_factory=time.monotonic)
+
+    @classmethod
+    def of(cls, lp: StabilizationLP) -> ScaledLP:
+        """Scale the LP with weight ``lp.solve_weight``."""
+        started = time.monotonic()
+        weight = lp.solve_weight
+        b_unit, c_unit = _unit(weight), _unit(lp.cost)
+        return cls(lp.A, weight / b_unit, lp.cost / c_unit, b_unit, c_unit, started)
+
+    def seconds_left(self, limit: float | None) -> float | None:
+        """Return what building the LP has left of a time limit."""
+        return None if limit is None else max(limit - (time.monotonic() - self.started), 0.0)
+
+    def late(self, limit: float | None) -> bool:
+        """Return whether a time limit has passed."""
+        return self.seconds_left(limit) == 0.0
+
+    def value(self, y: Any) -> Floats | None:
+        """Return V from the multipliers of A x = b; None where they are not n finite numbers."""
+        return _finite(y, len(self.b), self.c_unit)
+
+    def occupation(self, x: Any) -> Floats | None:
+        """Return theta from x; None where it is not K finite numbers."""
+        return _finite(x, len(self.c), self.b_unit)
+
+
+def failure(error: BaseException) -> Solution:
+    """Return the solution that stands for a solver's exception; Ctrl-C and exit go through.
+
+    Panics of solvers written in Rust derive from BaseException alone.
+    """
+    if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit):
+        raise error
+    text = " ".join(str(error).split())
+    return Solution(Stop.FAILED, f"{type(error).__name__}: {text}"[:200])
+
+
+def _unit(values: Floats) -> float:
+    top = float(values.max(initial=0.0))
+    return top if top > 0 else 1.0
+
+
+def _finite(values: Any, count: int, unit: float) -> Floats | None:
+    if values is None:
+        return None
+    with np.errstate(over="ignore", invalid="ignore"):
+        array = np.asarray(values, dtype=np.float64).reshape(-1) * unit
+    return array if len(array) == count and np.isfinite(array).all() else None

@@ -1,0 +1,239 @@
+"""Checking a saved result: recompile the problem, then judge every claim of the directory.
+
+Nothing in the directory is trusted: the finite model is made anew from the problem, and the stored
+vectors are checked against it by the same inequalities that certified them.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lmdsl import archive
+from lmdsl.certificate import Certificate, Witness, check
+from lmdsl.errors import BadInput
+from lmdsl.graph import CellStatus
+from lmdsl.lp import StabilizationLP, compile
+from lmdsl.result import Result
+from lmdsl.rows import Rows, Shares
+from lmdsl.sampling import noise_nodes, sample_points
+from lmdsl.systems import FunctionSystem
+from lmdsl.transitions import Progress, Regions
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The outcome of :func:`verify`.
+
+    Attributes
+    ----------
+    holds
+        The status is ``verified`` or ``not_stabilizable`` and every claim holds.
+    status
+        The status the directory claims.
+    same_model
+        The recompiled model has the stored digest, bit for bit.
+    certificate
+        The claims as judged now.
+    reasons
+        What does not hold, one sentence each.
+    notes
+        What else to know, one sentence each.
+    """
+
+    holds: bool
+    status: str
+    same_model: bool
+    certificate: Certificate
+    reasons: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        from lmdsl.result import jsonable
+
+        proof = self.certificate
+        return {
+            "holds": self.holds,
+            "status": self.status,
+            "same_model": self.same_model,
+            "claims": {
+                name: getattr(proof, name) for name in (*archive.CLAIMS, "refusal")
+            },
+            "cost": jsonable(proof.cost),
+            "lower_bound": jsonable(proof.lower),
+            "gap": jsonable(proof.gap),
+            "contraction": jsonable(proof.contraction),
+            "reasons": list(self.reasons),
+            "notes": list(self.notes),
+        }
+
+
+def verify(path: str | os.PathLike[str], progress: Progress | None = None) -> Verification:
+    """Recompile the problem of a result directory and check every claim it makes.
+
+    Raises
+    ------
+    BadInput
+        The directory cannot be read.
+    """
+    result = archive.load(path)
+    notes: list[str] = []
+    if isinstance(result.problem.system, FunctionSystem):
+        lp = _stored_model(Path(path), result)
+        notes.append("the system is a Python function, which was not re-evaluated: its saved rows")
+        notes[-1] += " were checked"
+    else:
+        lp = compile(result.problem, progress)
+    same = lp.digest == result.model_sha256
+    if not same:
+        notes.append("the recompiled model differs from the stored one; claims are judged on it")
+    reasons: list[str] = []
+    if not np.array_equal(lp.cell_status, result.cell_status):
+        reasons.append("cell_status differs from the recompiled model")
+    if result.status == "not_stabilizable":
+        certificate = _judge_refusal(lp, result, reasons)
+    else:
+        certificate = _judge_claims(lp, result, reasons)
+        if result.status != "verified":
+            reasons.append(f"the status is {result.status}, not verified")
+    return Verification(
+        not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
+    )
+
+
+def _judge_claims(lp: StabilizationLP, result: Result, reasons: list[str]) -> Certificate:
+    pair = _policy(lp, result)
+    if pair is None:
+        reasons.append("control_index is no policy on the stabilizable set")
+    on = lp.cells
+    V_up, W = result.value[on], result.lower[on]
+    witness = Witness(pair, result.witness[on], V_up, W, result.measure[on])
+    certificate = check(lp, witness, result.tolerance or 0.0)
+    reasons += certificate.reasons
+    claimed = (
+        ("cost", certificate.cost, result.cost, True),
+        ("lower_bound", certificate.lower, result.lower_bound, False),
+        ("gap", certificate.gap, result.gap, True),
+        ("contraction", certificate.contraction, result.contraction, True),
+    )
+    for name, now, stored, is_upper in claimed:
+        if now is None or stored is None:
+            continue
+        slack = 1e-12 * abs(now) if name in ("cost", "lower_bound") else 1e-15
+        false = now > stored + slack if is_upper else now < stored - slack
+        if false or not math.isfinite(stored):
+            reasons.append(f"{name} is stored as {stored!r}, but is {now!r}")
+    _judge_outside(lp, result, reasons)
+    if result.gamma != lp.gamma:
+        reasons.append(f"gamma is stored as {result.gamma!r}, but the problem says {lp.gamma!r}")
+    return certificate
+
+
+def _judge_outside(lp: StabilizationLP, result: Result, reasons: list[str]) -> None:
+    attractor = lp.cell_status == CellStatus.ATTRACTOR
+    outside = lp.cell_status > CellStatus.STABILIZED
+    for name, on_attractor, off in (
+        ("value", 0.0, np.inf),
+        ("lower", 0.0, np.inf),
+        ("measure", 0.0, 0.0),
+        ("control_index", -1, -1),
+    ):
+        array = getattr(result, name)
+        if not ((array[attractor] == on_attractor).all() and (array[outside] == off).all()):
+            reasons.append(f"{name} has a wrong value outside the stabilizable set")
+
+
+def _judge_refusal(lp: StabilizationLP, result: Result, reasons: list[str]) -> Certificate:
+    witness = Witness(None, result.witness[lp.cells])
+    certificate = check(lp, witness, result.tolerance or 0.0)
+    proved = {
+        "empty": not lp.n,
+        "measure": bool(lp.n) and not lp.weight.any(),
+        "require_all": bool(
+            (
+                (lp.cell_status >= CellStatus.ESCAPES) & (lp.cell_status <= CellStatus.LEADS_TO_THESE)
+            ).any()
+        ),
+        "gamma": certificate.refusal,
+    }
+    if not proved.get(result.cause or "", False):
+        reasons.append(f"the refusal ({result.cause}) is not proved by the recompiled model")
+    return certificate
+
+
+def _policy(lp: StabilizationLP, result: Result) -> np.ndarray[Any, Any] | None:
+    """Return the columns of the stored controls, None where one is no surviving pair."""
+    wanted = result.control_index[lp.cells]
+    M = len(lp.controls)
+    key = lp.cell.astype(np.int64) * M + lp.control
+    target = np.arange(lp.n, dtype=np.int64) * M + wanted
+    pair = np.minimum(np.searchsorted(key, target), max(lp.K - 1, 0))
+    if not lp.K or (wanted < 0).any() or (key[pair] != target).any():
+        return None
+    return pair
+
+
+def _stored_model(folder: Path, result: Result) -> StabilizationLP:
+    """Rebuild the LP of a Python function from its saved rows."""
+    status, problem = result.cell_status, result.problem
+    regions = Regions.of(problem, result.partition)
+    cells = np.flatnonzero(status == CellStatus.STABILIZED)
+    n, K = len(cells), int(result.pairs or 0)
+    nodes, points = noise_nodes(problem), sample_points(problem)
+    path = folder / "model.npz"
+    small = archive.read_arrays(
+        path,
+        {
+            "pair_pointer": ((n + 1,), "<i8"),
+            "control": ((K,), "<i4"),
+            "pointer": ((K + 1,), "<i8"),
+            "cost": ((K,), "<f8"),
+        },
+    )
+    entries = int(small["pointer"][-1])
+    if not 0 <= entries <= K * points * len(nodes.weights):
+        raise BadInput("pointer is out of range", "model.npz")
+    large = archive.read_arrays(
+        path, {"target": ((entries,), "<i4"), "code": ((entries,), "<u4")}
+    )
+    shares = Shares.of(points, nodes)
+    rows = Rows(
+        small["pointer"],
+        large["target"],
+        large["code"].astype(np.min_scalar_type(max(len(shares.numerator) - 1, 0))),
+        shares,
+        n,
+    )
+    _refuse_broken(rows, small, len(result.control_vectors))
+    support = regions.support[cells]
+    return StabilizationLP(
+        problem, result.partition, result.control_vectors, status, cells,
+        small["pair_pointer"], small["control"], rows, small["cost"], problem.gamma,
+        support / max(int(support.sum()), 1),
+    )  # fmt: skip
+
+
+def _refuse_broken(rows: Rows, small: dict[str, Any], controls: int) -> None:
+    pairs, pointer = small["pair_pointer"], rows.pointer
+    sound = (
+        pairs[0] == 0
+        and pairs[-1] == rows.count
+        and (np.diff(pairs) > 0).all()
+        and pointer[0] == 0
+        and (np.diff(pointer) > 0).all()
+        and ((small["control"] >= 0) & (small["control"] < controls)).all()
+        and ((rows.target >= 0) & (rows.target <= rows.columns)).all()
+        and (rows.code < len(rows.shares.numerator)).all()
+        and (np.isfinite(small["cost"]) & (small["cost"] >= 0)).all()
+    )
+    if not sound:
+        raise BadInput("the saved rows are inconsistent", "model.npz")
+    for k in range(rows.count):
+        if sum(share for _, share in rows.exact(k)) != rows.shares.total:
+            raise BadInput(f"row {k} does not sum to 1", "model.npz")
