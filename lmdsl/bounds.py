@@ -37,6 +37,17 @@ def expected_above(lp: StabilizationLP, pair: Pairs, x: Floats, gamma: float) ->
     return upper
 
 
+def decrease(lp: StabilizationLP, pair: Pairs, w: Floats, g: float) -> Floats | None:
+    """Return d > 0 with w >= g P_u w + d, rounded down; None where w > 0 has no such d.
+
+    It proves that the spectral radius of g P_u is at most 1 - min d/w < 1.
+    """
+    if not (np.isfinite(w).all() and (w > 0).all()):
+        return None
+    d = (w - expected_above(lp, pair, w, g)) * (1 - 4 * UNIT)
+    return d if (d > 0).all() else None
+
+
 def add_above(a: Floats, b: Floats) -> Floats:
     """Return an upper bound of a + b for nonnegative a, b; exact where one is 0."""
     total = a + b

@@ -111,21 +111,12 @@ class Verified:
 
 def check_stabilizing(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
     """Claim 1: return the proved contraction 1 - min d/w < 1, None where it does not hold."""
-    d = decrease(lp, pair, w)
+    d = bounds.decrease(lp, pair, w, lp.growth)
     if d is None or not len(w):
         return None
     share = float((d / w).min()) * (1 - 4 * bounds.UNIT)
     contraction = float(np.nextafter(1 - share, 2.0))
     return max(contraction, 0.0) if contraction < 1 else None
-
-
-def decrease(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
-    """Return d > 0 with w >= g P_u w + d, rounded down; None where there is none."""
-    if not (np.isfinite(w).all() and (w > 0).all()):
-        return None
-    d = w - bounds.expected_above(lp, pair, w, lp.growth)
-    d = d * (1 - 4 * bounds.UNIT)
-    return d if (d > 0).all() else None
 
 
 def check_upper(lp: StabilizationLP, pair: Pairs, V_up: Floats) -> bool:
@@ -184,11 +175,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
     residual = None if pair is None or mu is None else check_measure(lp, pair, mu)
     cost = weighted(lp, V_up) if upper and V_up is not None else None
     floor = weighted(lp, W) if lower and W is not None else None
-    gap = None
-    if cost is not None and floor is not None:
-        gap = 0.0
-        if cost > 0:
-            gap = max(weighted(lp, V_up - W) / cost * (1 + 8 * bounds.UNIT), 0.0)
+    both = cost is not None and floor is not None
     certificate = Certificate(
         stabilizing=contraction is not None,
         upper_bound=upper,
@@ -198,7 +185,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
         contraction=contraction,
         cost=cost,
         lower=floor,
-        gap=gap,
+        gap=gap(lp, V_up, W) if both else None,
         measure_residual=residual,
         tolerance=tolerance,
     )
@@ -239,9 +226,9 @@ def _explained(
                 "the Lyapunov measure could not be established"
                 + ("" if shown is None else f": its residual is {shown:.2g}, above 1e-9")
             )
-        gap = certificate.gap
-        if gap is not None and gap > certificate.tolerance:
-            reasons.append(f"the gap {gap:.3g} is above the tolerance {certificate.tolerance:.3g}")
+        width = certificate.gap
+        if width is not None and width > certificate.tolerance:
+            reasons.append(f"the gap {width:.3g} is above the tolerance {certificate.tolerance:.3g}")
     return replace(certificate, reasons=tuple(reasons))
 
 
@@ -278,31 +265,61 @@ def certify(
     value, w
         Guesses of the policy's value and its unit-cost value; made where missing.
     """
-    w, d = stability_vector(lp, pair, w)
+    w, d = policy.stability_vector(lp, pair, w)
     V = policy.evaluate(lp, pair, start=value)
-    V_up = None if V is None else upper_vector(lp, pair, V, w, d)
-    W = lower_vector(lp, V, tolerance)
-    mu = None if V is None else _measure_vector(lp, pair)
-    witness = Witness(pair, w, V_up, W, mu)
+    if V is None:
+        witness = Witness(pair, w, None, lower_vector(lp, None, tolerance), None)
+        return Verified(check(lp, witness, tolerance), witness)
+    V_up, W = upper_vector(lp, pair, V, w, d), lower_vector(lp, V, tolerance)
+    best = gap(lp, V_up, W)
+    for slack in RELATIVE_SLACK:
+        if best <= tolerance:
+            break
+        V_up = _lesser(lp, V_up, _upper_with_slack(lp, pair, slack))
+        W = _greater(lp, W, _lower_with_slack(lp, pair, V, slack))
+        best = gap(lp, V_up, W)
+    witness = Witness(pair, w, V_up, W, _measure_vector(lp, pair))
     return Verified(check(lp, witness, tolerance), witness)
 
 
-def stability_vector(
-    lp: StabilizationLP, pair: Pairs, guess: Floats | None = None
-) -> tuple[Floats | None, Floats | None]:
-    """Return w > 0 and d > 0 with w >= g P_u w + d: the unit-cost value of the policy.
+def gap(lp: StabilizationLP, V_up: Floats | None, W: Floats | None) -> float:
+    """Return m'(V_up - W) / m'V_up, rounded up; 0 if m'V_up = 0, infinite if one is missing."""
+    if V_up is None or W is None:
+        return math.inf
+    cost = weighted(lp, V_up)
+    if cost == 0:
+        return 0.0
+    return max(weighted(lp, V_up - W) / cost * (1 + 8 * bounds.UNIT), 0.0)
 
-    Where it spans so many decades that 1 is lost in rounding, the value at a slightly larger
-    weight leaves a relative slack instead.
-    """
-    unit = np.ones(lp.K)
-    if guess is not None and (d := decrease(lp, pair, guess)) is not None:
-        return guess, d
-    for inflation in (0.0, 5e-7, 1e-10):
-        w = policy.evaluate(lp, pair, lp.growth * (1 + inflation), unit, guess)
-        if w is not None and (d := decrease(lp, pair, w)) is not None:
-            return w, d
-    return None, None
+
+RELATIVE_SLACK = (1e-13, 1e-11, 1e-9)
+"""Near gamma_bar an absolute slack drowns in the rounding of large values. The value at
+gamma (1 + s) leaves a slack s gamma P V relative to V above; the optimum at gamma (1 - s) below."""
+
+
+def _upper_with_slack(lp: StabilizationLP, pair: Pairs, slack: float) -> Floats | None:
+    V = policy.evaluate(lp, pair, lp.gamma * (1 + slack))
+    return V if V is not None and check_upper(lp, pair, V) else None
+
+
+def _lower_with_slack(
+    lp: StabilizationLP, pair: Pairs, V: Floats, slack: float
+) -> Floats | None:
+    gamma = lp.gamma * (1 - slack)
+    value = policy.evaluate(lp, pair, gamma, start=V)
+    if value is None:
+        return None
+    W = policy.iterate(lp, pair, value, gamma, limit=20).value
+    return W if check_lower(lp, W) else None
+
+
+def _lesser(lp: StabilizationLP, a: Floats | None, b: Floats | None) -> Floats | None:
+    known = [x for x in (a, b) if x is not None]
+    return min(known, key=lambda x: weighted(lp, x), default=None)
+
+
+def _greater(lp: StabilizationLP, a: Floats, b: Floats | None) -> Floats:
+    return a if b is None or weighted(lp, a) >= weighted(lp, b) else b
 
 
 def upper_vector(

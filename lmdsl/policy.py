@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bellman, graph, linear
+from lmdsl import bellman, bounds, graph, linear
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -183,6 +183,25 @@ def _sub_lp(lp: StabilizationLP, columns: Pairs, inside: Pairs) -> Stabilization
     )
 
 
+def stability_vector(
+    lp: StabilizationLP, pair: Pairs, guess: Floats | None = None, g: float | None = None
+) -> tuple[Floats, Floats] | tuple[None, None]:
+    """Return w > 0, d > 0 with w >= g P_u w + d: a proof that the policy is g-stabilizing.
+
+    w is the unit-cost value. Where it spans so many decades that 1 is lost in rounding, the value
+    at a slightly larger weight leaves a relative slack instead.
+    """
+    g = lp.growth if g is None else g
+    unit = np.ones(lp.K)
+    if guess is not None and (d := bounds.decrease(lp, pair, guess, g)) is not None:
+        return guess, d
+    for inflation in (0.0, 5e-7, 1e-10):
+        w = evaluate(lp, pair, g * (1 + inflation), unit, guess)
+        if w is not None and (d := bounds.decrease(lp, pair, w, g)) is not None:
+            return w, d
+    return None, None
+
+
 @dataclass(frozen=True)
 class Feasible:
     """A gamma-stabilizing policy, with its unit-cost value w = 1 + g P_u w."""
@@ -222,24 +241,23 @@ def stabilizing(lp: StabilizationLP, stop: Stop = lambda: False) -> Feasible | R
     """
     g, unit = lp.growth, np.ones(lp.K)
     pair = lp.tree[1]
-    w = evaluate(lp, pair, g, unit)
+    w, _ = stability_vector(lp, pair)
     if w is not None:
         return Feasible(pair, w)
     at, value = 1.0, evaluate(lp, pair, 1.0, unit)
     if value is None:
         return Undecided(pair, 0.0)
-    reach = g
-    refused_at = 0
+    refuse_at = 0
     for step in range(200):
-        if stop():
-            return Undecided(pair, at)
         done = iterate(lp, pair, value, at, unit, stop=stop)
         pair, value = done.pair, done.value
-        w = evaluate(lp, pair, g, unit)
+        w, _ = stability_vector(lp, pair)
         if w is not None:
             return Feasible(pair, w)
-        if step == refused_at:
-            refused_at = 2 * refused_at + 4
+        if stop():
+            break
+        if step == refuse_at:
+            refuse_at = 2 * refuse_at + 4
             proof = refusal(lp, stop)
             if proof is not None:
                 return Refused(proof, pair, at)
@@ -247,9 +265,9 @@ def stabilizing(lp: StabilizationLP, stop: Stop = lambda: False) -> Feasible | R
         reach, raised = g, None
         while raised is None and reach > at * (1 + 1e-13):
             reach = at + (reach - at) / 2
-            raised = evaluate(lp, pair, reach, unit)
+            raised, _ = stability_vector(lp, pair, g=reach)
         if raised is None:
-            return Undecided(pair, at)
+            break
         at, value = reach, raised
     return Undecided(pair, at)
 

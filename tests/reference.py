@@ -603,12 +603,13 @@ def policy_value(
             inside = P[np.ix_(at, at)]
             matrix = np.eye(len(at)) - gamma * inside
             try:
-                v = np.linalg.solve(matrix, right)
+                inverse = np.linalg.inv(matrix)
+                v = inverse @ right
                 for _ in range(3):  # iterative refinement, residual in long double
                     long = v.astype(np.longdouble)
                     image = np.longdouble(gamma) * (inside.astype(np.longdouble) @ long)
                     residual = (right - (long - image)).astype(float)
-                    v = (long + np.linalg.solve(matrix, residual)).astype(float)
+                    v = (long + inverse @ residual).astype(float)
             except np.linalg.LinAlgError:
                 v = np.full(len(at), np.nan)
             V[at] = v

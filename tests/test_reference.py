@@ -348,7 +348,7 @@ def test_a_linear_program_finds_the_same_cost(drawn):
         assert -lp.fun == pytest.approx(sum(solution.V.values()), rel=1e-5, abs=1e-5)
 
 
-# -------------------------------------------------------------------- exact brute force, tiny models
+# ------------------------------------------------------------------ exact brute force, tiny models
 
 
 def tiny_model(rng):

@@ -82,26 +82,26 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     highs = highspy.Highs()
     highs.setOptionValue("output_flag", False)
     _choose(highs, options, scaled.seconds_left(options.time_limit))
-    highs.passModel(_model(highspy, scaled))
-    highs.run()
+    try:
+        highs.passModel(_model(highspy, scaled))
+        highs.run()
+    except BaseException as error:
+        return failure(error)
     status = highs.getModelStatus()
     found, info = highs.getSolution(), highs.getInfo()
     stop = STOPS.get(status.name, Stop.FAILED)
-    claimed = stop not in (Stop.INFEASIBLE, Stop.UNBOUNDED)
-    return Solution(
-        stop,
-        highs.modelStatusToString(status),
-        scaled.value(found.row_dual) if claimed and found.dual_valid else None,
-        scaled.occupation(found.col_value) if claimed and found.value_valid else None,
-        iterations=sum(max(getattr(info, name), 0) for name in ITERATIONS),
-    )
+    iterations = sum(max(getattr(info, name), 0) for name in ITERATIONS)
+    y = found.row_dual if found.dual_valid else None
+    x = found.col_value if found.value_valid else None
+    return scaled.solution(stop, highs.modelStatusToString(status), y, x, iterations)
 
 
 def _choose(highs: Any, options: Options, seconds: float | None) -> None:
     algorithm = options.algorithm or next(iter(ALGORITHMS))
     for name, word in ALGORITHMS[algorithm].items():
-        if not _accepted(highs, name, word):  # an option refused would silently mean simplex
-            raise MissingDependency(
+        older = {"ipx": "ipm"}.get(word, word)  # what highspy before 1.12 calls it
+        if not (_accepted(highs, name, word) or _accepted(highs, name, older)):
+            raise MissingDependency(  # HiGHS itself would go on, with simplex
                 f"this highspy has no {algorithm}; install highspy[extras] or a newer highspy, or "
                 "use highs:simplex",
                 "backend",

@@ -8,6 +8,7 @@ Back: V = max G * y with y the multiplier of A x = b, and theta = max m * x.
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -59,13 +60,31 @@ class ScaledLP:
         """Return whether a time limit has passed."""
         return self.seconds_left(limit) == 0.0
 
-    def value(self, y: Any) -> Floats | None:
-        """Return V from the multipliers of A x = b; None where they are not n finite numbers."""
-        return _finite(y, len(self.b), self.c_unit)
+    def solution(
+        self,
+        stop: Stop,
+        word: str,
+        y: Any,
+        x: Any,
+        iterations: int | None,
+        details: Mapping[str, Any] | None = None,
+    ) -> Solution:
+        """Return what a solver found, in the units of the model.
 
-    def occupation(self, x: Any) -> Floats | None:
-        """Return theta from x; None where it is not K finite numbers."""
-        return _finite(x, len(self.c), self.b_unit)
+        Parameters
+        ----------
+        stop, word, iterations, details
+            As in :class:`Solution`.
+        y, x
+            Multipliers of A x = b with the sign of V, and x; None where there are none. Dropped
+            where not finite, where they are a ray, and where no iteration made them.
+        """
+        ray = stop in (Stop.INFEASIBLE, Stop.UNBOUNDED)
+        if ray or not (stop.success or iterations):
+            y = x = None
+        value = _finite(y, len(self.b), self.c_unit)
+        occupation = _finite(x, len(self.c), self.b_unit)
+        return Solution(stop, word, value, occupation, None, iterations, details or {})
 
 
 def failure(error: BaseException) -> Solution:

@@ -1,0 +1,579 @@
+"""Plots of a problem and its result; :func:`figure` puts all of them on one page.
+
+One and two dimensions are drawn as they are. More are cut: ``axes`` names the one or two axes
+shown (default: the first two), ``at`` where the others are held (default: at the attractor's
+centre); runs are projected. Greys are cells that cannot be stabilized, by cause.
+"""
+
+from __future__ import annotations
+
+import textwrap
+import warnings
+from collections.abc import Mapping, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lmdsl import canvas
+from lmdsl.canvas import INK, View, plain
+from lmdsl.controller import draw_starts
+from lmdsl.errors import BadInput, shown
+from lmdsl.files import write_whole
+from lmdsl.graph import CellStatus
+from lmdsl.partition import Partition
+from lmdsl.problem import Problem
+from lmdsl.sampling import control_values, noise_nodes
+from lmdsl.systems.base import NamedOde, OdeSystem
+from lmdsl.transitions import Regions
+
+if TYPE_CHECKING:
+    import os
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from lmdsl.result import Result
+
+FORMATS = ("png", "pdf", "svg")
+Floats = NDArray[np.float64]
+At = Mapping[str, float]
+
+
+def portrait(
+    problem: Problem | Result,
+    control: ArrayLike | Mapping[str, float] | None = None,
+    ax: Axes | None = None,
+    *,
+    axes: Sequence[str] | None = None,
+    at: At | None = None,
+    starts: int = 12,
+    steps: int = 300,
+) -> Axes:
+    """Draw the phase portrait of the true map at a constant control.
+
+    A grid of initial states is followed, one colour per height of the start: dots for a map,
+    lines for a differential equation. In one dimension: the graph of the map, the diagonal and a
+    cobweb. Noise is held at its mean; a run ends where it leaves the box.
+
+    Parameters
+    ----------
+    problem
+        A problem or a result.
+    control
+        The control: a number, a sequence, or values by name. Default: the control of the grid
+        nearest to zero.
+    ax
+        Axes to draw into; new ones if None.
+    axes, at
+        Which axes are shown and where the others are held.
+    starts, steps
+        Initial states per axis, and steps of each.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    given = problem if isinstance(problem, Problem) else problem.problem
+    partition = Partition.of(given)
+    attractor = Regions.of(given, partition).attractor
+    view = View.of(partition, attractor, axes, at)
+    u = _control_vector(given, control)
+    held = ", ".join(f"{plain(k, 16)} = {v:.3g}" for k, v in u.items())
+    word = "flow" if _is_ode(given) else "map"
+    ax = canvas.frame(ax, view, f"{word} at {held}{view.note}" if held else f"{word}{view.note}")
+    if len(view.axes) == 1:
+        if partition.dimension > 1:
+            raise BadInput("a phase portrait needs two axes", "axes")
+        _cobweb(ax, given, view, u)
+        canvas.region(ax, view, view.slice(attractor), CellStatus.ATTRACTOR)
+        return ax
+    base = partition.low + (view.cell + 0.5) * partition.width
+    grid = np.stack(np.meshgrid(*[(np.arange(starts) + 0.5) / starts] * 2), axis=-1).reshape(-1, 2)
+    x = np.tile(base, (len(grid), 1))
+    shown_axes = list(view.axes)
+    span = (partition.high - partition.low)[shown_axes]
+    x[:, shown_axes] = partition.low[shown_axes] + grid * span
+    points = _orbits(given, partition, x, u, steps)
+    _draw_orbits(ax, view, points, grid[:, 1], _is_ode(given))
+    canvas.region(ax, view, view.shadow(attractor), CellStatus.ATTRACTOR, above=True)
+    return ax
+
+
+def cost(
+    result: Result,
+    ax: Axes | None = None,
+    *,
+    axes: Sequence[str] | None = None,
+    at: At | None = None,
+    legend: bool = True,
+) -> Axes:
+    """Draw the cost-to-go V over the cells, the attractor, and by cause what has no control.
+
+    Colours are logarithmic when V spans more than two decades.
+
+    Parameters
+    ----------
+    result
+        A result of any status.
+    ax
+        Axes to draw into; new ones if None.
+    axes, at
+        Which axes are shown and where the others are held.
+    legend
+        Explain the regions below the axes.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    view = _view(result, axes, at)
+    solved = result.status != "not_stabilizable"
+    word = "optimal cost" if result.verified else "cost, not verified" if solved else "causes"
+    ax = canvas.frame(ax, view, word + view.note)
+    value = view.slice(_on_stabilized(result, result.value))
+    if np.isfinite(value).any():
+        canvas.scalar(ax, view, value, "cost-to-go V", "viridis")
+    canvas.regions(ax, view, view.slice(_codes(result)), legend)
+    return ax
+
+
+def control(
+    result: Result,
+    name: str | None = None,
+    ax: Axes | None = None,
+    *,
+    axes: Sequence[str] | None = None,
+    at: At | None = None,
+    legend: bool = False,
+) -> Axes:
+    """Draw one control of the feedback law over the cells.
+
+    Parameters
+    ----------
+    result
+        A result of any status; without a controller only the regions are drawn.
+    name
+        The control variable; default: the first.
+    ax
+        Axes to draw into; new ones if None.
+    axes, at
+        Which axes are shown and where the others are held.
+    legend
+        Explain the regions below the axes.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+
+    Raises
+    ------
+    BadInput
+        There is no such control.
+    """
+    names = result.problem.controls
+    if not names:
+        raise BadInput("the system is autonomous: it has no control to draw", "control_grid")
+    chosen = names[0] if name is None else name
+    if chosen not in names:
+        raise BadInput(
+            f"{shown(chosen)} is no control; the controls are {', '.join(names)}", "name"
+        )
+    k = names.index(chosen)
+    view = _view(result, axes, at)
+    ax = canvas.frame(ax, view, f"control {plain(chosen, 24)}{view.note}")
+    index = view.slice(result.control_index)
+    if (index >= 0).any():
+        values = np.where(index >= 0, result.control_vectors[index, k], np.nan)
+        grid = control_values(result.problem)[k]
+        canvas.levels(ax, view, values, grid, f"control {plain(chosen, 24)}")
+    elif (result.control_index < 0).all():
+        canvas.remark(ax, "no controller")
+    canvas.regions(ax, view, view.slice(_codes(result)), legend)
+    return ax
+
+
+def measure(
+    result: Result,
+    ax: Axes | None = None,
+    *,
+    axes: Sequence[str] | None = None,
+    at: At | None = None,
+    legend: bool = False,
+) -> Axes:
+    """Draw the Lyapunov measure of the closed loop over the cells.
+
+    Parameters
+    ----------
+    result
+        A result of any status; without a measure only the regions are drawn.
+    ax
+        Axes to draw into; new ones if None.
+    axes, at
+        Which axes are shown and where the others are held.
+    legend
+        Explain the regions below the axes.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    view = _view(result, axes, at)
+    ax = canvas.frame(ax, view, "Lyapunov measure" + view.note)
+    if result.measure.any():
+        values = view.slice(_on_stabilized(result, result.measure))
+        canvas.scalar(ax, view, values, "Lyapunov measure", "cividis")
+    else:
+        canvas.remark(ax, "no Lyapunov measure")
+    canvas.regions(ax, view, view.slice(_codes(result)), legend)
+    return ax
+
+
+def trajectories(
+    result: Result,
+    ax: Axes | None = None,
+    starts: int | ArrayLike = 16,
+    seed: int = 0,
+    *,
+    steps: int = 500,
+    axes: Sequence[str] | None = None,
+    at: At | None = None,
+    legend: bool = False,
+) -> Axes:
+    """Draw closed-loop runs of the true map, from a ring to the attractor, a dot, or a loss, x.
+
+    Lines for a differential equation, dots joined by thin lines for a map, broken where a
+    periodic axis wraps; one dimension is drawn over the step number.
+
+    Parameters
+    ----------
+    result
+        A result; without a controller only the regions are drawn.
+    ax
+        Axes to draw into; new ones if None.
+    starts
+        Number of random starts, drawn by m, or states, shape (r, d).
+    seed
+        Seed of the starts and the noise.
+    steps
+        Step limit.
+    axes, at
+        Which axes are shown; regions other than the attractor are shown in up to two dimensions.
+    legend
+        Explain the regions below the axes.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    view = _view(result, axes, at)
+    ax = canvas.frame(ax, view, "closed loop")
+    status = result.cell_status
+    attractor = view.shadow(status == CellStatus.ATTRACTOR)
+    code = np.where(attractor, np.uint8(CellStatus.ATTRACTOR), np.uint8(CellStatus.STABILIZED))
+    if not view.hidden:
+        code = view.slice(_codes(result))
+    if (result.control_index < 0).all() or not result.weight.any():
+        canvas.remark(ax, "no controller")
+        canvas.regions(ax, view, code, legend)
+        return ax
+    x = _starts(result, starts, seed)
+    points, last = _closed_loop(result, x, steps, seed)
+    reached = (last >= 0) & (status[last] == CellStatus.ATTRACTOR)
+    running = (last >= 0) & (status[last] == CellStatus.STABILIZED)
+    ax.set_title(f"closed loop, {int(reached.sum())} of {len(x)} runs reach A", fontsize=11)
+    if len(view.axes) == 1:
+        ax.set_xlabel("step")
+        ax.set_ylabel(view.label(0))
+        ax.set_xlim(-0.5, len(points) - 0.5)
+        ax.set_ylim(*view.ends(0))
+        _bands(ax, view, code)
+    else:
+        canvas.regions(ax, view, code, legend)
+    _draw_runs(ax, view, points, reached, ~reached & ~running, _is_ode(result.problem))
+    return ax
+
+
+def figure(
+    result: Result,
+    path: str | os.PathLike[str] | None = None,
+    *,
+    axes: Sequence[str] | None = None,
+    at: At | None = None,
+    seed: int = 0,
+) -> Figure:
+    """Draw one page with everything: portrait, cost, controls, measure, runs and the numbers.
+
+    Parameters
+    ----------
+    result
+        A result of any status.
+    path
+        File to write, ending in .png, .pdf or .svg; it appears whole or not at all.
+    axes, at
+        Which axes are shown and where the others are held.
+    seed
+        Seed of the closed-loop runs.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    BadInput
+        The ending is unknown, or the file cannot be written.
+    """
+    target = None if path is None else Path(path)
+    kind = "" if target is None else target.suffix[1:].lower()
+    if target is not None and kind not in FORMATS:
+        raise BadInput(f"{shown(str(target), 200)}: a plot ends in .png, .pdf or .svg")
+    view = _view(result, axes, at)
+    draw: list[Any] = []
+    if len(view.axes) == 2 or not view.hidden:
+        draw.append(lambda ax: portrait(result, ax=ax, axes=axes, at=at))
+    draw.append(lambda ax: cost(result, ax, axes=axes, at=at))
+    if (result.control_index >= 0).any():
+        for name in result.problem.controls[:4]:
+            draw.append(lambda ax, name=name: control(result, name, ax, axes=axes, at=at))
+        draw.append(lambda ax: measure(result, ax, axes=axes, at=at))
+        draw.append(lambda ax: trajectories(result, ax, seed=seed, axes=axes, at=at))
+    draw.append(lambda ax: _numbers(ax, result))
+    columns = min(len(draw), 4 if len(draw) in (7, 8) else 3)
+    rows = -(-len(draw) // columns)
+    page = canvas.blank(columns, rows)
+    page.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
+    for k, panel in enumerate(draw):
+        panel(page.add_subplot(rows, columns, k + 1))
+    page.suptitle(plain(result.problem.name, 100), fontsize=13)
+    if target is not None:
+        content = BytesIO()
+        stamp = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Glyph .* missing from")
+            page.savefig(content, format=kind, dpi=200, metadata=stamp)
+        write_whole(target, content.getvalue())
+    return page
+
+
+def _view(result: Result, axes: Sequence[str] | None, at: At | None) -> View:
+    return View.of(result.partition, result.cell_status == CellStatus.ATTRACTOR, axes, at)
+
+
+def _is_ode(problem: Problem) -> bool:
+    return isinstance(problem.system, OdeSystem | NamedOde)
+
+
+def _on_stabilized(result: Result, values: Floats) -> Floats:
+    known = (result.cell_status == CellStatus.STABILIZED) & np.isfinite(values)
+    return np.where(known, values, np.nan)
+
+
+def _codes(result: Result) -> NDArray[np.uint8]:
+    """Return the region of every cell: its status, or what a refusal says of it."""
+    code = result.cell_status.copy()
+    free = code == CellStatus.STABILIZED
+    if result.status == "not_stabilizable":
+        code[free] = canvas.UNSOLVED
+        if result.cause == "gamma":
+            code[free & (result.witness > 0)] = canvas.INFINITE
+    return code
+
+
+def _control_vector(
+    problem: Problem, control: ArrayLike | Mapping[str, float] | None
+) -> dict[str, float]:
+    names = problem.controls
+    if control is None:
+        grid = control_values(problem)
+        return {k: float(v[np.argmin(np.abs(v))]) for k, v in zip(names, grid, strict=True)}
+    if isinstance(control, Mapping):
+        if set(control) != set(names):
+            raise BadInput(f"name every control once: {', '.join(names)}", "control")
+        control = [control[k] for k in names]
+    values = np.atleast_1d(np.asarray(control, dtype=np.float64))
+    if values.shape != (len(names),) or not np.isfinite(values).all():
+        raise BadInput(f"give {len(names)} finite numbers ({', '.join(names)})", "control")
+    return dict(zip(names, map(float, values), strict=True))
+
+
+def _image(problem: Problem, x: Floats, u: Mapping[str, float]) -> Floats:
+    """Return the image of states, shape (r, d), at a constant control and the mean noise."""
+    nodes = noise_nodes(problem)
+    noise = nodes.weights @ nodes.values / nodes.weights.sum()
+    values: dict[str, Any] = {k: x[:, i] for i, k in enumerate(problem.states)}
+    values |= {k: np.full(len(x), v) for k, v in u.items()}
+    values |= {k: np.full(len(x), v) for k, v in zip(problem.noises, noise, strict=True)}
+    with np.errstate(all="ignore"):
+        images = problem.step()(values)
+    return np.stack([np.broadcast_to(image, len(x)) for image in images], axis=-1)
+
+
+def _orbits(
+    problem: Problem, partition: Partition, x: Floats, u: Mapping[str, float], steps: int
+) -> Floats:
+    """Return states of open-loop runs, shape (steps + 1, r, d), NaN after leaving the box."""
+    points = np.full((steps + 1, *x.shape), np.nan)
+    points[0] = x
+    active = np.arange(len(x))
+    span = partition.high - partition.low
+    for n in range(steps):
+        image = _image(problem, points[n, active], u)
+        inside = partition.locate(list(image.T)) >= 0
+        finite = np.isfinite(image).all(axis=1)
+        with np.errstate(invalid="ignore"):
+            image = np.where(
+                partition.periodic, partition.low + np.mod(image - partition.low, span), image
+            )
+        if partition.clip:
+            image = np.clip(image, partition.low, partition.high)
+        points[n + 1, active[finite]] = image[finite]
+        active = active[inside]
+        if not len(active):
+            break
+    return points
+
+
+def _draw_orbits(ax: Axes, view: View, points: Floats, height: Floats, lines: bool) -> None:
+    import matplotlib
+    from matplotlib.collections import LineCollection
+
+    colours = matplotlib.colormaps["viridis"](0.95 * height)
+    if lines:
+        pieces, run = canvas.segments(points, view)
+        made = LineCollection(pieces, colors=colours[run], linewidths=0.7, rasterized=True)
+        ax.add_collection(made)
+        return
+    where = points[..., list(view.axes)]
+    order = np.random.default_rng(0).permutation(where[..., 0].size)
+    flat = where.reshape(-1, 2)[order]
+    colour = np.tile(colours, (len(points), 1))[order]
+    ax.scatter(*flat.T, c=colour, s=0.7, linewidths=0, rasterized=True)
+
+
+def _cobweb(ax: Axes, problem: Problem, view: View, u: Mapping[str, float]) -> None:
+    p = view.partition
+    low, high = view.ends(0)
+    ax.set_ylim(low, high)
+    ax.set_ylabel(f"next {view.label(0)}")
+    x = np.linspace(low, high, 2001)
+    image = _image(problem, x[:, None], u)[:, 0]
+    if p.periodic[0]:
+        image = low + np.mod(image - low, high - low)
+        image[1:][np.abs(np.diff(image)) > (high - low) / 2] = np.nan
+    ax.plot([low, high], [low, high], color="#999999", linewidth=0.8)
+    ax.plot(x, image, color=canvas.CYCLE[0], linewidth=1.8)
+    start = np.array([[low + 0.1234 * (high - low)]])
+    orbit = _orbits(problem, p, start, u, 60)[:, 0, 0]
+    web = np.repeat(orbit[np.isfinite(orbit)], 2)
+    ax.plot(web[:-2], web[1:-1], color=canvas.CYCLE[1], linewidth=0.6, alpha=0.8)
+
+
+def _starts(result: Result, starts: int | ArrayLike, seed: int) -> Floats:
+    d = result.partition.dimension
+    if isinstance(starts, int | np.integer):
+        if starts < 1:
+            raise BadInput(f"{starts} is not a positive number", "starts")
+        cells = np.flatnonzero(result.weight)
+        rng = np.random.default_rng(seed)
+        return draw_starts(result.partition, cells, result.weight[cells], int(starts), rng)
+    x = np.asarray(starts, dtype=np.float64)
+    if x.ndim != 2 or x.shape[1] != d:
+        raise BadInput(f"states have shape (r, {d}), not {x.shape}", "starts")
+    return x
+
+
+def _closed_loop(
+    result: Result, x: Floats, steps: int, seed: int
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Return states of runs, shape (T, r, d), NaN after their end, and the last cell of each."""
+    loop, rng = result.closed_loop, np.random.default_rng(seed)
+    cell = result.partition.locate(list(x.T))
+    points = [x]
+    for _ in range(steps):
+        on = np.flatnonzero((cell >= 0) & (result.cell_status[cell] == CellStatus.STABILIZED))
+        if not len(on):
+            break
+        following = np.full_like(x, np.nan)
+        following[on], cell[on] = loop.step(points[-1][on], cell[on], rng)
+        points.append(following)
+    return np.array(points), cell
+
+
+def _bands(ax: Axes, view: View, code: NDArray[np.integer]) -> None:
+    """Fill the regions of one axis as horizontal bands."""
+    edges = view.edges(0)
+    for k, (_, colour, hatch) in canvas.REGIONS.items():
+        for first, last in _runs(code == k):
+            style = {"facecolor": colour, "hatch": hatch or None, "edgecolor": "#8c8c8c"}
+            ax.axhspan(edges[first], edges[last], linewidth=0, zorder=0.5, **style)
+
+
+def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    edge = np.diff(np.pad(mask.astype(np.int8), 1))
+    return list(zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True))
+
+
+def _draw_runs(
+    ax: Axes,
+    view: View,
+    points: Floats,
+    reached: NDArray[np.bool_],
+    lost: NDArray[np.bool_],
+    lines: bool,
+) -> None:
+    """Draw closed-loop runs with their starts and ends."""
+    from matplotlib.collections import LineCollection
+
+    colours = np.array(canvas.CYCLE)[np.arange(points.shape[1]) % len(canvas.CYCLE)]
+    where = points[..., list(view.axes)]
+    if len(view.axes) == 1:
+        step = np.broadcast_to(np.arange(len(points))[:, None, None], where.shape)
+        where = np.concatenate([step, where], axis=-1)
+        pieces = np.stack([where[:-1], where[1:]], axis=-2)
+        run = np.broadcast_to(np.arange(points.shape[1]), pieces.shape[:2]).ravel()
+        pieces = pieces.reshape(-1, 2, 2)
+    else:
+        pieces, run = canvas.segments(points, view)
+    width, alpha = (1.1, 0.9) if lines else (0.6, 0.45)
+    ax.add_collection(
+        LineCollection(pieces, colors=colours[run], linewidths=width, alpha=alpha, zorder=2)
+    )
+    if not lines:
+        colour = np.tile(colours, len(points))
+        ax.scatter(*where.reshape(-1, 2).T, c=colour, s=9, linewidths=0, zorder=2.2)
+    taken = np.isfinite(points).all(axis=-1).sum(axis=0) - 1
+    end = where[taken, np.arange(points.shape[1])]
+    ax.scatter(*where[0].T, s=22, facecolors="white", edgecolors=colours, zorder=2.5)
+    ax.scatter(*end[reached].T, s=14, c=INK, linewidths=0, zorder=4)
+    ax.scatter(*end[lost].T, s=34, c=INK, marker="x", linewidths=1.4, zorder=4)
+
+
+def _numbers(ax: Axes, result: Result) -> None:
+    """Write the status and the key numbers."""
+
+    def number(value: float | None) -> str:
+        return "unknown" if value is None else f"{value:.6g}"
+
+    cells = f"{result.stabilizable_cells} of {result.cells} stabilizable"
+    rows = [
+        ("status", result.status.replace("_", " ")),
+        ("backend", plain(result.backend or "none", 30)),
+        ("gamma", number(result.gamma)),
+        ("cost", number(result.cost)),
+        ("lower bound", number(result.lower_bound)),
+        ("gap", "unknown" if result.gap is None else f"{result.gap:.1e}"),
+        ("cells", cells),
+        ("attractor", f"{result.attractor_cells} cells"),
+        ("controls", number(result.controls)),
+    ]
+    ax.set_axis_off()
+    for k, (name, value) in enumerate(rows):
+        y = 0.97 - 0.075 * k
+        ax.text(0.02, y, name, transform=ax.transAxes, va="top", color="#666666")
+        ax.text(0.34, y, value, transform=ax.transAxes, va="top", color=INK)
+    message = textwrap.fill(plain(result.message, 300), 46)
+    y = 0.97 - 0.075 * (len(rows) + 0.5)
+    ax.text(0.02, y, message, transform=ax.transAxes, va="top", fontsize=9, color=INK)

@@ -1,0 +1,381 @@
+"""What every backend promises, driven by one table: a new backend adds its specs there, no test.
+
+Known answers are derived by hand; the standard map is compared with policy iteration.
+"""
+
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from lmdsl import lp as model
+from lmdsl.backends import BUILT_IN, Options, Solution, Stop, get, names, resolve
+from lmdsl.backends import clarabel as clarabel_backend
+from lmdsl.backends import cvxpy as cvxpy_backend
+from lmdsl.backends import highs as highs_backend
+from lmdsl.backends.scaled import ScaledLP, failure
+from lmdsl.errors import BadInput, MissingDependency
+from lmdsl.lp import StabilizationLP
+from lmdsl.problem import Problem
+from lmdsl.systems import StandardMap
+
+SPECS = [
+    f"{name}:{algorithm}" for name in BUILT_IN for algorithm in get(name).capabilities.algorithms
+]
+SPECS += [f"cvxpy:{solver}" for solver in ("", "clarabel", "highs", "scipy", "scs", "osqp")]
+SLOW = {"cvxpy:osqp"}  # too slow for the standard map
+every = pytest.mark.parametrize("spec", SPECS)
+fast = pytest.mark.parametrize("spec", [spec for spec in SPECS if spec not in SLOW])
+
+
+def solve(spec: str, lp: StabilizationLP, **options) -> Solution:
+    backend, algorithm = resolve(spec)
+    try:
+        return backend.solve(lp, Options(algorithm=algorithm, **options))
+    except MissingDependency as missing:
+        pytest.skip(missing.message)
+
+
+def compiled(system, cells, periodic, controls, gamma, per_axis) -> StabilizationLP:
+    problem = {
+        "format": "lmdsl/1",
+        "system": {"kind": "map", "next": {"x": system}},
+        "state_box": {"x": {"low": 0, "high": 1, "cells": cells, "periodic": periodic}},
+        "attractor": {"cells": [[0]]},
+        "control_grid": controls,
+        "stage_cost": "1",
+        "sampling": {"kind": "grid", "per_axis": per_axis},
+        "gamma": gamma,
+    }
+    return model.compile(Problem.model_validate(problem))
+
+
+@cache
+def doubling(gamma: float) -> StabilizationLP:
+    """x+ = 2x on two cells: half of cell 1 goes to the attractor, half stays."""
+    return compiled("2*x", 2, True, {}, gamma, 2)
+
+
+@cache
+def steps(gamma: float) -> StabilizationLP:
+    """x+ = x - u/4 on four cells: stay, or one cell down towards the attractor."""
+    controls = {"u": {"low": 0, "high": 1, "points": 2}}
+    return compiled("x - 0.25*u", 4, False, controls, gamma, 1)
+
+
+@cache
+def standard_map() -> StabilizationLP:
+    box = {name: axis | {"cells": 20} for name, axis in StandardMap.problem["state_box"].items()}
+    problem = StandardMap.problem | {"state_box": box}
+    return model.compile(Problem.model_validate(problem))
+
+
+@cache
+def reference() -> np.ndarray:
+    return get("policy-iteration").solve(standard_map(), Options()).value
+
+
+@dataclass(frozen=True, repr=False)
+class Weighted(StabilizationLP):
+    """The same model, solved with another weight."""
+
+    other: np.ndarray | None = None
+
+    @property
+    def solve_weight(self) -> np.ndarray:
+        return self.other
+
+
+def weighted(lp: StabilizationLP, weight: np.ndarray) -> Weighted:
+    fields = {name: getattr(lp, name) for name in StabilizationLP.__dataclass_fields__}
+    return Weighted(**fields, other=weight)
+
+
+# Known answers ------------------------------------------------------------------------------
+
+
+@every
+@pytest.mark.parametrize("gamma", [0.9, 1.0, 1.5])
+def test_doubling_map(spec, gamma):
+    # V = 1 + gamma/2 V and theta = 1 + gamma/2 theta on the one cell of C.
+    found = solve(spec, doubling(gamma))
+    assert found.stop is Stop.OPTIMAL
+    assert found.value == pytest.approx([1 / (1 - gamma / 2)], rel=1e-6)
+    if found.occupation is not None:
+        assert found.occupation == pytest.approx([1 / (1 - gamma / 2)], rel=1e-6)
+
+
+@every
+@pytest.mark.parametrize("gamma", [0.5, 1.0, 1.25])
+def test_steps_to_the_attractor(spec, gamma):
+    lp = steps(gamma)
+    found = solve(spec, lp)
+    g = gamma
+    assert found.stop is Stop.OPTIMAL
+    assert found.value == pytest.approx([1, 1 + g, 1 + g + g**2], rel=1e-6)
+    if found.occupation is not None:
+        # A third of the mass starts in each cell and moves down; nobody stays.
+        mass = np.array([1 + g + g**2, 1 + g, 1]) / 3
+        assert found.occupation[lp.control == 1] == pytest.approx(mass, rel=1e-5)
+        assert found.occupation[lp.control == 0] == pytest.approx(np.zeros(3), abs=1e-5)
+        assert (found.occupation > 1e-5).sum() == 3
+
+
+@every
+def test_value_is_the_derivative_of_the_cost_in_the_weight(spec):
+    lp = steps(1.25)
+    weight = np.array([0.5, 0.3, 0.2])
+    base = solve(spec, weighted(lp, weight))
+    if base.occupation is None:
+        pytest.skip("no occupation measure")
+    for i in range(3):
+        h = 0.1 * np.eye(3)[i]
+        moved = solve(spec, weighted(lp, weight + h))
+        slope = lp.cost @ (moved.occupation - base.occupation) / 0.1
+        assert slope == pytest.approx(base.value[i], rel=1e-4)
+
+
+@fast
+def test_agrees_with_policy_iteration_on_the_standard_map(spec):
+    lp = standard_map()
+    found = solve(spec, lp)
+    assert found.stop is Stop.OPTIMAL
+    assert found.value == pytest.approx(reference(), rel=1e-5)
+    if found.occupation is not None:
+        assert lp.cost @ found.occupation == pytest.approx(reference().mean(), rel=1e-5)
+
+
+# Numbers of any size ------------------------------------------------------------------------
+
+
+@every
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_units_of_the_cost_do_not_matter(spec, unit):
+    lp = steps(1.0)
+    found = solve(spec, replace(lp, cost=lp.cost * unit))
+    assert found.stop is Stop.OPTIMAL
+    assert found.value / unit == pytest.approx([1, 2, 3], rel=1e-6)
+
+
+@fast
+def test_units_of_the_cost_do_not_matter_on_the_standard_map(spec):
+    lp = standard_map()
+    found = solve(spec, replace(lp, cost=lp.cost * 1e-9))
+    assert found.stop is Stop.OPTIMAL
+    assert found.value / 1e-9 == pytest.approx(reference(), rel=1e-5)
+
+
+@fast
+def test_no_cost_is_worth_nothing(spec):
+    lp = standard_map()
+    found = solve(spec, replace(lp, cost=np.zeros(lp.K)))
+    assert found.stop is Stop.OPTIMAL
+    assert found.value == pytest.approx(np.zeros(lp.n), abs=1e-6)
+
+
+def test_scaling_goes_back():
+    lp = replace(steps(1.0), cost=np.array([0, 4, 2, 4, 4, 1.0]))
+    scaled = ScaledLP.of(weighted(lp, np.array([0.5, 0.25, 0.25])))
+    assert scaled.c.max() == scaled.b.max() == 1
+    found = scaled.solution(Stop.OPTIMAL, "", np.ones(3), np.ones(6), 1)
+    assert (found.value == 4).all()
+    assert (found.occupation == 0.5).all()
+
+
+# Refusals, limits, failures ------------------------------------------------------------------
+
+
+@every
+@pytest.mark.parametrize("gamma", [2.0, 3.0])
+def test_infeasible_is_never_a_success(spec, gamma):
+    found = solve(spec, doubling(gamma))
+    assert not found.stop.success
+    assert found.stop is not Stop.UNBOUNDED
+    if gamma == 3.0:
+        assert found.stop is Stop.INFEASIBLE
+        assert found.value is None
+
+
+@every
+@pytest.mark.parametrize("limit", [{"time_limit": 1e-9}, {"max_iterations": 1}])
+def test_a_limit_is_never_a_success(spec, limit):
+    found = solve(spec, standard_map(), **limit)
+    assert not found.stop.success
+    assert found.stop.limit or "SolverError" in found.word  # CVXPY loses some limits
+    assert found.word
+
+
+@fast
+def test_a_tighter_tolerance_is_accepted(spec):
+    found = solve(spec, standard_map(), tolerance=1e-9, time_limit=60.0)
+    assert found.stop is Stop.OPTIMAL
+    assert found.value == pytest.approx(reference(), rel=1e-5)
+    assert "not supported" not in found.details
+
+
+@every
+def test_inputs_are_untouched(spec):
+    lp = steps(1.25)
+    arrays = (lp.cost, lp.weight, lp.pair_pointer, lp.control, lp.cells, lp.rows.pointer,
+              lp.rows.target, lp.rows.code, lp.rows.shares.value)  # fmt: skip
+    before = [array.tobytes() for array in arrays]
+    solve(spec, lp)
+    assert [array.tobytes() for array in arrays] == before
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_are_dropped(bad):
+    scaled = ScaledLP.of(steps(1.0))
+    y, x = np.array([1, bad, 1]), np.array([1, 1, 1, 1, 1, bad])
+    found = scaled.solution(Stop.OPTIMAL, "", y, x, 1)
+    assert found.value is None
+    assert found.occupation is None
+    assert scaled.solution(Stop.OPTIMAL, "", y[:1], x[:1], 1).value is None
+
+
+def test_rays_and_starting_points_are_no_values():
+    scaled = ScaledLP.of(steps(1.0))
+    for stop, iterations in ((Stop.INFEASIBLE, 5), (Stop.UNBOUNDED, 5), (Stop.TIME_LIMIT, 0)):
+        assert scaled.solution(stop, "", np.ones(3), np.ones(6), iterations).value is None
+    assert scaled.solution(Stop.TIME_LIMIT, "", np.ones(3), np.ones(6), 5).value is not None
+
+
+def test_exceptions_become_failures_but_not_interrupts():
+    class PanicException(BaseException):
+        pass
+
+    found = failure(PanicException("index\nout of bounds"))
+    assert found.stop is Stop.FAILED
+    assert found.word == "PanicException: index out of bounds"
+    with pytest.raises(KeyboardInterrupt):
+        failure(KeyboardInterrupt())
+
+
+def test_cvxpy_survives_a_panic(monkeypatch):
+    import cvxpy
+
+    class PanicException(BaseException):
+        pass
+
+    def panic(*_, **__):
+        raise PanicException("called `Option::unwrap()` on a `None` value")
+
+    monkeypatch.setattr(cvxpy.Problem, "solve", panic)
+    found = solve("cvxpy", steps(1.0))
+    assert found.stop is Stop.FAILED
+    assert "unwrap" in found.word
+
+
+@pytest.mark.parametrize("error", ["SolverError", "DCPError"])
+def test_cvxpy_errors_are_failures(monkeypatch, error):
+    import cvxpy
+
+    def fail(*_, **__):
+        raise getattr(cvxpy.error, error)("no")
+
+    monkeypatch.setattr(cvxpy.Problem, "solve", fail)
+    assert solve("cvxpy", steps(1.0)).stop is Stop.FAILED
+
+
+def test_an_unknown_cvxpy_solver_is_refused_with_the_installed_ones():
+    import cvxpy
+
+    with pytest.raises(BadInput) as refused:
+        get("cvxpy").solve(steps(1.0), Options(algorithm="nope"))
+    assert all(name in refused.value.message for name in cvxpy.installed_solvers())
+
+
+def test_cvxpy_names_the_options_a_solver_does_not_get():
+    options = Options(tolerance=1e-6, time_limit=1.0, max_iterations=5)
+    passed, unsupported = cvxpy_backend._passed("DAQP", options, 1.0)
+    assert passed == {}
+    assert unsupported == ["time_limit", "max_iterations", "tolerance"]
+
+
+@pytest.mark.parametrize("name", ["highs", "clarabel", "cvxpy"])
+def test_no_tolerance_is_looser_than_without_one(name):
+    module = {"highs": highs_backend, "cvxpy": cvxpy_backend}.get(name)
+    if module is highs_backend:
+        import highspy
+
+        for option, (default, _) in highs_backend.TOLERANCES.items():
+            assert default <= highspy.Highs().getOptionValue(option)[1]
+    elif module is cvxpy_backend:
+        for solver in cvxpy_backend.TOLERANCE:
+            loose = cvxpy_backend._passed(solver, Options(tolerance=1.0), None)
+            assert loose == cvxpy_backend._passed(solver, Options(), None)
+    else:
+        import clarabel
+
+        for option in clarabel_backend.TOLERANCES:
+            settings = clarabel_backend._settings(clarabel, Options(tolerance=1.0), "qdldl")
+            assert getattr(settings, option) <= getattr(clarabel.DefaultSettings(), option)
+
+
+# Statuses ------------------------------------------------------------------------------------
+
+
+def highs_statuses():
+    import highspy
+
+    return set(highspy.HighsModelStatus.__members__)
+
+
+def clarabel_statuses():
+    import clarabel
+
+    return {name for name in dir(clarabel.SolverStatus) if not name.startswith("_")}
+
+
+def cvxpy_statuses():
+    from cvxpy import settings
+
+    return {*settings.SOLUTION_PRESENT, *settings.INF_OR_UNB, *settings.INACCURATE, *settings.ERROR}
+
+
+@pytest.mark.parametrize(
+    ("backend", "statuses"),
+    [
+        (highs_backend, highs_statuses),
+        (clarabel_backend, clarabel_statuses),
+        (cvxpy_backend, cvxpy_statuses),
+    ],
+)
+def test_every_status_is_mapped(backend, statuses):
+    assert statuses() == set(backend.STOPS)
+    success = {word for word, stop in backend.STOPS.items() if stop.success}
+    assert success <= {"kOptimal", "Solved", "AlmostSolved", "optimal", "optimal_inaccurate"}
+
+
+def test_almost_at_a_limit_is_the_limit():
+    clarabel, cvxpy = clarabel_backend._stop, cvxpy_backend._stop
+    assert clarabel("AlmostSolved", 7, 200, False) is Stop.INACCURATE
+    assert clarabel("AlmostSolved", 200, 200, False) is Stop.ITERATION_LIMIT
+    assert clarabel("AlmostSolved", 7, 200, True) is Stop.TIME_LIMIT
+    assert clarabel("a new word", 7, 200, False) is Stop.FAILED
+    assert cvxpy("optimal_inaccurate", "CLARABEL", 7, None, False) is Stop.INACCURATE
+    assert cvxpy("optimal_inaccurate", "CLARABEL", 7, 7, False) is Stop.ITERATION_LIMIT
+    assert cvxpy("optimal_inaccurate", "CLARABEL", 7, None, True) is Stop.TIME_LIMIT
+    assert cvxpy("optimal_inaccurate", "SCS", 7, None, False) is Stop.ITERATION_LIMIT
+    assert cvxpy("user_limit", "OSQP", 7, None, True) is Stop.TIME_LIMIT
+    assert cvxpy("a new word", "HIGHS", 7, None, False) is Stop.FAILED
+
+
+# The registry --------------------------------------------------------------------------------
+
+
+def test_every_built_in_backend_carries_its_name():
+    assert [get(name).name for name in BUILT_IN] == list(BUILT_IN) == list(names())[: len(BUILT_IN)]
+
+
+def test_no_solver_is_imported_unasked():
+    code = (
+        "import sys, lmdsl.backends as b\n"
+        "[b.get(name) for name in b.BUILT_IN]\n"
+        "print([m for m in ('highspy', 'clarabel', 'cvxpy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
