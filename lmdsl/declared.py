@@ -23,11 +23,24 @@ _K = TypeVar("_K")
 _V = TypeVar("_V")
 
 _FIXES = {
+    "bool_type": "write true or false",
+    "dict_type": "write an object in braces",
     "extra_forbidden": "unknown key; remove it or correct its spelling",
-    "missing": "required key is missing; add it",
     "finite_number": "must be a finite number",
-    "frozen_instance": "declared objects are frozen; make a new one with model_copy(update=...)",
+    "float_type": "write a number",
+    "greater_than": "it must be greater than {gt}",
+    "greater_than_equal": "it must be at least {ge}",
+    "int_type": "write a whole number",
+    "less_than": "it must be less than {lt}",
+    "less_than_equal": "it must be at most {le}",
+    "literal_error": "write {expected}",
+    "missing": "required key is missing; add it",
+    "string_type": "write a string",
+    "too_long": "at most {max_length} entries are allowed",
+    "too_short": "give at least {min_length} of them",
+    "tuple_type": "write a list in brackets",
 }
+"""What to do about each kind of fault that pydantic finds."""
 
 
 class FrozenDict(dict[_K, _V]):
@@ -133,8 +146,11 @@ def bad_input(error: ValidationError) -> BadInput:
     elif first["type"] in ("extra_forbidden", "missing"):
         message = _FIXES[first["type"]]
     else:
-        text = _FIXES.get(first["type"], first["msg"][:1].lower() + first["msg"][1:])
-        message = f"{shown(first['input'])} is not accepted: {text}"
+        fix = _FIXES.get(first["type"])
+        fix = fix.format(**first.get("ctx", {})) if fix else first["msg"]
+        given = first["input"]
+        given = list(given) if isinstance(given, tuple) else given
+        message = f"{shown(given)} is not accepted; {fix}"
     more = len(faults) - 1
     if more:
         message += f" (and {more} more fault{'s' if more > 1 else ''})"

@@ -3,6 +3,9 @@
 One and two dimensions are drawn as they are. More are cut: ``axes`` names the one or two axes
 shown (default: the first two), ``at`` where the others are held (default: at the attractor's
 centre); runs are projected. Greys are cells that cannot be stabilized, by cause.
+
+Every function draws into the matplotlib axes it is given, or makes a figure of its own without
+touching matplotlib's global state: ``ax.figure.savefig(...)``.
 """
 
 from __future__ import annotations
@@ -17,16 +20,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lmdsl import canvas
-from lmdsl.canvas import INK, View, plain
-from lmdsl.controller import draw_starts
+from lmdsl.drawing import layers, runs
+from lmdsl.drawing.view import At, Floats, View, plain
 from lmdsl.errors import BadInput, shown
 from lmdsl.files import write_whole
 from lmdsl.graph import CellStatus
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.sampling import control_values, noise_nodes
-from lmdsl.systems.base import NamedOde, OdeSystem
+from lmdsl.sampling import control_values
 from lmdsl.transitions import Regions
 
 if TYPE_CHECKING:
@@ -38,8 +39,6 @@ if TYPE_CHECKING:
     from lmdsl.result import Result
 
 FORMATS = ("png", "pdf", "svg")
-Floats = NDArray[np.float64]
-At = Mapping[str, float]
 
 
 def portrait(
@@ -362,10 +361,6 @@ def _view(result: Result, axes: Sequence[str] | None, at: At | None) -> View:
     return View.of(result.partition, result.cell_status == CellStatus.ATTRACTOR, axes, at)
 
 
-def _is_ode(problem: Problem) -> bool:
-    return isinstance(problem.system, OdeSystem | NamedOde)
-
-
 def _on_stabilized(result: Result, values: Floats) -> Floats:
     known = (result.cell_status == CellStatus.STABILIZED) & np.isfinite(values)
     return np.where(known, values, np.nan)
@@ -380,175 +375,6 @@ def _codes(result: Result) -> NDArray[np.uint8]:
         if result.cause == "gamma":
             code[free & (result.witness > 0)] = canvas.INFINITE
     return code
-
-
-def _control_vector(
-    problem: Problem, control: ArrayLike | Mapping[str, float] | None
-) -> dict[str, float]:
-    names = problem.controls
-    if control is None:
-        grid = control_values(problem)
-        return {k: float(v[np.argmin(np.abs(v))]) for k, v in zip(names, grid, strict=True)}
-    if isinstance(control, Mapping):
-        if set(control) != set(names):
-            raise BadInput(f"name every control once: {', '.join(names)}", "control")
-        control = [control[k] for k in names]
-    values = np.atleast_1d(np.asarray(control, dtype=np.float64))
-    if values.shape != (len(names),) or not np.isfinite(values).all():
-        raise BadInput(f"give {len(names)} finite numbers ({', '.join(names)})", "control")
-    return dict(zip(names, map(float, values), strict=True))
-
-
-def _image(problem: Problem, x: Floats, u: Mapping[str, float]) -> Floats:
-    """Return the image of states, shape (r, d), at a constant control and the mean noise."""
-    nodes = noise_nodes(problem)
-    noise = nodes.weights @ nodes.values / nodes.weights.sum()
-    values: dict[str, Any] = {k: x[:, i] for i, k in enumerate(problem.states)}
-    values |= {k: np.full(len(x), v) for k, v in u.items()}
-    values |= {k: np.full(len(x), v) for k, v in zip(problem.noises, noise, strict=True)}
-    with np.errstate(all="ignore"):
-        images = problem.step()(values)
-    return np.stack([np.broadcast_to(image, len(x)) for image in images], axis=-1)
-
-
-def _orbits(
-    problem: Problem, partition: Partition, x: Floats, u: Mapping[str, float], steps: int
-) -> Floats:
-    """Return states of open-loop runs, shape (steps + 1, r, d), NaN after leaving the box."""
-    points = np.full((steps + 1, *x.shape), np.nan)
-    points[0] = x
-    active = np.arange(len(x))
-    span = partition.high - partition.low
-    for n in range(steps):
-        image = _image(problem, points[n, active], u)
-        inside = partition.locate(list(image.T)) >= 0
-        finite = np.isfinite(image).all(axis=1)
-        with np.errstate(invalid="ignore"):
-            image = np.where(
-                partition.periodic, partition.low + np.mod(image - partition.low, span), image
-            )
-        if partition.clip:
-            image = np.clip(image, partition.low, partition.high)
-        points[n + 1, active[finite]] = image[finite]
-        active = active[inside]
-        if not len(active):
-            break
-    return points
-
-
-def _draw_orbits(ax: Axes, view: View, points: Floats, height: Floats, lines: bool) -> None:
-    import matplotlib
-    from matplotlib.collections import LineCollection
-
-    colours = matplotlib.colormaps["viridis"](0.95 * height)
-    if lines:
-        pieces, run = canvas.segments(points, view)
-        made = LineCollection(pieces, colors=colours[run], linewidths=0.7, rasterized=True)
-        ax.add_collection(made)
-        return
-    where = points[..., list(view.axes)]
-    order = np.random.default_rng(0).permutation(where[..., 0].size)
-    flat = where.reshape(-1, 2)[order]
-    colour = np.tile(colours, (len(points), 1))[order]
-    ax.scatter(*flat.T, c=colour, s=0.7, linewidths=0, rasterized=True)
-
-
-def _cobweb(ax: Axes, problem: Problem, view: View, u: Mapping[str, float]) -> None:
-    p = view.partition
-    low, high = view.ends(0)
-    ax.set_ylim(low, high)
-    ax.set_ylabel(f"next {view.label(0)}")
-    x = np.linspace(low, high, 2001)
-    image = _image(problem, x[:, None], u)[:, 0]
-    if p.periodic[0]:
-        image = low + np.mod(image - low, high - low)
-        image[1:][np.abs(np.diff(image)) > (high - low) / 2] = np.nan
-    ax.plot([low, high], [low, high], color="#999999", linewidth=0.8)
-    ax.plot(x, image, color=canvas.CYCLE[0], linewidth=1.8)
-    start = np.array([[low + 0.1234 * (high - low)]])
-    orbit = _orbits(problem, p, start, u, 60)[:, 0, 0]
-    web = np.repeat(orbit[np.isfinite(orbit)], 2)
-    ax.plot(web[:-2], web[1:-1], color=canvas.CYCLE[1], linewidth=0.6, alpha=0.8)
-
-
-def _starts(result: Result, starts: int | ArrayLike, seed: int) -> Floats:
-    d = result.partition.dimension
-    if isinstance(starts, int | np.integer):
-        if starts < 1:
-            raise BadInput(f"{starts} is not a positive number", "starts")
-        cells = np.flatnonzero(result.weight)
-        rng = np.random.default_rng(seed)
-        return draw_starts(result.partition, cells, result.weight[cells], int(starts), rng)
-    x = np.asarray(starts, dtype=np.float64)
-    if x.ndim != 2 or x.shape[1] != d:
-        raise BadInput(f"states have shape (r, {d}), not {x.shape}", "starts")
-    return x
-
-
-def _closed_loop(
-    result: Result, x: Floats, steps: int, seed: int
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Return states of runs, shape (T, r, d), NaN after their end, and the last cell of each."""
-    loop, rng = result.closed_loop, np.random.default_rng(seed)
-    cell = result.partition.locate(list(x.T))
-    points = [x]
-    for _ in range(steps):
-        on = np.flatnonzero((cell >= 0) & (result.cell_status[cell] == CellStatus.STABILIZED))
-        if not len(on):
-            break
-        following = np.full_like(x, np.nan)
-        following[on], cell[on] = loop.step(points[-1][on], cell[on], rng)
-        points.append(following)
-    return np.array(points), cell
-
-
-def _bands(ax: Axes, view: View, code: NDArray[np.integer]) -> None:
-    """Fill the regions of one axis as horizontal bands."""
-    edges = view.edges(0)
-    for k, (_, colour, hatch) in canvas.REGIONS.items():
-        for first, last in _runs(code == k):
-            style = {"facecolor": colour, "hatch": hatch or None, "edgecolor": "#8c8c8c"}
-            ax.axhspan(edges[first], edges[last], linewidth=0, zorder=0.5, **style)
-
-
-def _runs(mask: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    edge = np.diff(np.pad(mask.astype(np.int8), 1))
-    return list(zip(np.flatnonzero(edge == 1), np.flatnonzero(edge == -1), strict=True))
-
-
-def _draw_runs(
-    ax: Axes,
-    view: View,
-    points: Floats,
-    reached: NDArray[np.bool_],
-    lost: NDArray[np.bool_],
-    lines: bool,
-) -> None:
-    """Draw closed-loop runs with their starts and ends."""
-    from matplotlib.collections import LineCollection
-
-    colours = np.array(canvas.CYCLE)[np.arange(points.shape[1]) % len(canvas.CYCLE)]
-    where = points[..., list(view.axes)]
-    if len(view.axes) == 1:
-        step = np.broadcast_to(np.arange(len(points))[:, None, None], where.shape)
-        where = np.concatenate([step, where], axis=-1)
-        pieces = np.stack([where[:-1], where[1:]], axis=-2)
-        run = np.broadcast_to(np.arange(points.shape[1]), pieces.shape[:2]).ravel()
-        pieces = pieces.reshape(-1, 2, 2)
-    else:
-        pieces, run = canvas.segments(points, view)
-    width, alpha = (1.1, 0.9) if lines else (0.6, 0.45)
-    ax.add_collection(
-        LineCollection(pieces, colors=colours[run], linewidths=width, alpha=alpha, zorder=2)
-    )
-    if not lines:
-        colour = np.tile(colours, len(points))
-        ax.scatter(*where.reshape(-1, 2).T, c=colour, s=9, linewidths=0, zorder=2.2)
-    taken = np.isfinite(points).all(axis=-1).sum(axis=0) - 1
-    end = where[taken, np.arange(points.shape[1])]
-    ax.scatter(*where[0].T, s=22, facecolors="white", edgecolors=colours, zorder=2.5)
-    ax.scatter(*end[reached].T, s=14, c=INK, linewidths=0, zorder=4)
-    ax.scatter(*end[lost].T, s=34, c=INK, marker="x", linewidths=1.4, zorder=4)
 
 
 def _numbers(ax: Axes, result: Result) -> None:

@@ -419,6 +419,11 @@ class Problem(Declared):
 def load(path: str | os.PathLike[str]) -> Problem:
     """Read a problem file.
 
+    Parameters
+    ----------
+    path
+        A JSON file of at most 16 MiB.
+
     Raises
     ------
     BadInput

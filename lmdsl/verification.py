@@ -77,6 +77,13 @@ class Verification:
 def verify(path: str | os.PathLike[str], progress: Progress | None = None) -> Verification:
     """Recompile the problem of a result directory and check every claim it makes.
 
+    Parameters
+    ----------
+    path
+        The result directory.
+    progress
+        Called with (stage, fraction done) during long work.
+
     Raises
     ------
     BadInput

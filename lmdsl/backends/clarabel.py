@@ -16,10 +16,10 @@ from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.lp import StabilizationLP
 
 ALGORITHMS = {
-    "dual": "qdldl",
-    "primal": "qdldl",
-    "dual-faer": "faer",
-    "primal-faer": "faer",
+    "primal": "faer",
+    "dual": "faer",
+    "primal-qdldl": "qdldl",
+    "dual-qdldl": "qdldl",
 }
 """The factorisation of every algorithm, the default first."""
 

@@ -24,7 +24,7 @@ class Lorenz(NamedOde):
         "z": "x*y - beta*z",
     }
     step: Duration = 0.1
-    substeps: Substeps = 4
+    substeps: Substeps = 5
     summary = "Lorenz system: stabilize steady convection (C+) by adjusting the heating"
     source = (
         "E. N. Lorenz, Deterministic nonperiodic flow, Journal of the Atmospheric Sciences 20 "
@@ -39,7 +39,7 @@ class Lorenz(NamedOde):
             "kind": "lorenz",
             "parameters": {"sigma": 10, "rho": 28, "beta": 8 / 3},
             "step": 0.1,
-            "substeps": 4,
+            "substeps": 5,
         },
         "state_box": {
             "x": {"low": -24, "high": 24, "cells": 24},

@@ -19,7 +19,7 @@ class VanDerPol(NamedOde):
     defaults: ClassVar = {"mu": 1.0}
     formulas: ClassVar = {"x": "v", "v": "mu*(1 - x**2)*v - x + u"}
     step: Duration = 0.2
-    substeps: Substeps = 2
+    substeps: Substeps = 4
     summary = "van der Pol oscillator: bring it to rest against its limit cycle"
     source = (
         "B. van der Pol, On relaxation-oscillations, The London, Edinburgh and Dublin "
@@ -32,7 +32,7 @@ class VanDerPol(NamedOde):
             "kind": "van_der_pol",
             "parameters": {"mu": 1},
             "step": 0.2,
-            "substeps": 2,
+            "substeps": 4,
         },
         "state_box": {
             "x": {"low": -3, "high": 3, "cells": 60},

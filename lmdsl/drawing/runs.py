@@ -1,0 +1,157 @@
+"""Runs of the true map for plots: at a constant control, and in closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lmdsl.controller import draw_starts
+from lmdsl.errors import BadInput
+from lmdsl.graph import CellStatus
+from lmdsl.partition import Partition
+from lmdsl.problem import Problem
+from lmdsl.sampling import control_values, noise_nodes
+from lmdsl.systems.base import NamedOde, OdeSystem
+
+if TYPE_CHECKING:
+    from lmdsl.result import Result
+
+PIECES = 8
+"""Drawn lines of a differential equation have so many pieces a step."""
+
+Floats = NDArray[np.float64]
+Map = Callable[[Floats, Floats], Floats]
+
+
+def is_ode(problem: Problem) -> bool:
+    """Return whether states move continuously, so that runs are lines."""
+    return isinstance(problem.system, OdeSystem | NamedOde)
+
+
+def control_vector(
+    problem: Problem, control: ArrayLike | Mapping[str, float] | None
+) -> dict[str, float]:
+    """Return a control by name; None stands for the control of the grid nearest to zero."""
+    names = problem.controls
+    if control is None:
+        grid = control_values(problem)
+        return {k: float(v[np.argmin(np.abs(v))]) for k, v in zip(names, grid, strict=True)}
+    if isinstance(control, Mapping):
+        if set(control) != set(names):
+            raise BadInput(f"name every control once: {', '.join(names)}", "control")
+        control = [control[k] for k in names]
+    values = np.atleast_1d(np.asarray(control, dtype=np.float64))
+    if values.shape != (len(names),) or not np.isfinite(values).all():
+        raise BadInput(f"give {len(names)} finite numbers ({', '.join(names)})", "control")
+    return dict(zip(names, map(float, values), strict=True))
+
+
+def constant_map(problem: Problem, fine: bool = False) -> Map:
+    """Return the map (x, u) -> x+ on arrays (r, d) and (r, p), noise held at its mean.
+
+    With ``fine`` the map of a differential equation covers 1/PIECES of a step.
+    """
+    system: Any = problem.system
+    if fine:
+        few = -(-system.substeps // PIECES)
+        system = system.model_copy(update={"step": system.step / PIECES, "substeps": few})
+    step = system.compile(problem.states, problem.controls, problem.noises)
+    nodes = noise_nodes(problem)
+    noise = nodes.weights @ nodes.values / nodes.weights.sum()
+
+    def image(x: Floats, u: Floats) -> Floats:
+        values: dict[str, Any] = {k: x[:, i] for i, k in enumerate(problem.states)}
+        values |= {k: u[:, i] for i, k in enumerate(problem.controls)}
+        values |= {k: np.full(len(x), v) for k, v in zip(problem.noises, noise, strict=True)}
+        with np.errstate(all="ignore"):
+            images = step(values)
+        return np.stack([np.broadcast_to(part, len(x)) for part in images], axis=-1)
+
+    return image
+
+
+def into_box(partition: Partition, x: Floats) -> Floats:
+    """Wrap periodic axes and, where the problem clips, saturate the others."""
+    with np.errstate(invalid="ignore"):
+        turned = np.mod(x - partition.low, partition.high - partition.low)
+        kept = np.clip(x, partition.low, partition.high) if partition.clip else x
+    return np.where(partition.periodic, partition.low + turned, kept)
+
+
+def open_loop(
+    problem: Problem, partition: Partition, x: Floats, u: Mapping[str, float], steps: int
+) -> Floats:
+    """Return states of runs at a constant control, shape (T, r, d), NaN after leaving the box.
+
+    A step of a differential equation makes PIECES states.
+    """
+    fine = is_ode(problem)
+    image = constant_map(problem, fine)
+    points = np.full((steps * (PIECES if fine else 1) + 1, *x.shape), np.nan)
+    points[0] = x
+    active = np.arange(len(x))
+    held = np.tile(list(u.values()), (len(x), 1))
+    for n in range(len(points) - 1):
+        following = image(points[n, active], held[active])
+        inside = partition.locate(list(following.T)) >= 0
+        finite = np.isfinite(following).all(axis=1)
+        points[n + 1, active[finite]] = into_box(partition, following[finite])
+        active = active[inside]
+        if not len(active):
+            break
+    return points
+
+
+def starts_of(result: Result, starts: int | ArrayLike, seed: int) -> Floats:
+    """Return so many random starts, drawn by m, or the given ones, shape (r, d)."""
+    d = result.partition.dimension
+    if isinstance(starts, int | np.integer):
+        if starts < 1:
+            raise BadInput(f"{starts} is not a positive number", "starts")
+        cells = np.flatnonzero(result.weight)
+        rng = np.random.default_rng(seed)
+        return draw_starts(result.partition, cells, result.weight[cells], int(starts), rng)
+    x = np.array(starts, dtype=np.float64)
+    if x.ndim != 2 or x.shape[1] != d or not len(x):
+        raise BadInput(f"states have shape (r, {d}), not {x.shape}", "starts")
+    return x
+
+
+def closed_loop(
+    result: Result, x: Floats, steps: int, seed: int
+) -> tuple[Floats, NDArray[np.int64], int]:
+    """Run the true map under the controller until A, loss, or the step limit.
+
+    Returns
+    -------
+    points, cell, pieces
+        States, shape (T, r, d), NaN after the end of a run; the last cell of each run, -1
+        outside the box; and the number of states a step.
+    """
+    loop, problem, p = result.closed_loop, result.problem, result.partition
+    rng = np.random.default_rng(seed)
+    fine = is_ode(problem) and not problem.noises
+    inner = constant_map(problem, fine) if fine else None
+    cell = p.locate(list(x.T))
+    points = [x]
+    for _ in range(steps):
+        on = np.flatnonzero((cell >= 0) & (result.cell_status[cell] == CellStatus.STABILIZED))
+        if not len(on):
+            break
+        here, state = points[-1][on], cell[on]
+        following, cell[on] = loop.step(here, state, rng)
+        u = loop.controller.at(state)
+        for _ in range(PIECES - 1 if inner else 0):
+            here = inner(here, u) if inner else here
+            points.append(_scatter(x, on, into_box(p, here)))
+        points.append(_scatter(x, on, following))
+    return np.array(points), cell, PIECES if fine else 1
+
+
+def _scatter(like: Floats, rows: NDArray[np.int64], values: Floats) -> Floats:
+    spread = np.full_like(like, np.nan)
+    spread[rows] = values
+    return spread

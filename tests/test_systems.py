@@ -1,0 +1,532 @@
+"""The systems known by name: each default problem does what a specialist expects of it."""
+
+import functools
+import json
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import lmdsl as lm
+
+NAMED = lm.systems.NAMED
+EXAMPLES = Path(__file__).parents[1] / "examples"
+ATTRACTOR = 0
+
+# Attractor cells, stabilizable cells, and the least share of the other cells that is stabilizable.
+EXPECTED = {
+    "standard_map": (4, 2496, 1.0),
+    "logistic_map": (2, 198, 1.0),
+    "henon_map": (4, 3062, 0.9),
+    "double_integrator": (4, 4216, 0.85),
+    "inverted_pendulum": (4, 3860, 0.9),
+    "pendulum_on_cart": (4, 3280, 0.75),
+    "van_der_pol": (4, 3238, 0.85),
+    "lorenz": (8, 11222, 0.95),
+}
+
+
+@functools.cache
+def solved(name):
+    return lm.solve(lm.Problem.model_validate(NAMED[name].problem))
+
+
+def variant(name, **changes):
+    return lm.Problem.model_validate({**NAMED[name].problem, **changes})
+
+
+def control(result):
+    """The control (of one dimension) on the grid of cells, NaN where there is none."""
+    cells = np.arange(result.cells)
+    return result.controller.at(cells)[:, 0].reshape(result.partition.shape)
+
+
+def centres(result):
+    cells = np.arange(result.cells)
+    return result.partition.centres(cells).T.reshape(-1, *result.partition.shape)
+
+
+def on_grid(result, array):
+    return array.reshape(result.partition.shape)
+
+
+def action_values(result):
+    """Q of every surviving pair."""
+    lp = result.lp
+    return lp.gamma * (lp.P @ result.value[lp.cells]) + lp.c
+
+
+def assert_mirrored(result, sign, image):
+    """u at the image cell is sign times u, up to ties in Q; V is equal; C maps to itself."""
+    lp, Q = result.lp, action_values(result)
+    status = on_grid(result, result.cell_status)
+    assert (status == image(status)).all()
+    value = on_grid(result, result.value)
+    inside = np.isfinite(value)
+    np.testing.assert_allclose(image(value)[inside], value[inside], rtol=1e-9)
+    # What the mirrored cell does, done here: it must be as good as what is done here.
+    there = sign * image(control(result)).ravel()[lp.cells]
+    grid = lp.controls[:, 0]
+    index = np.abs(there[:, None] - grid).argmin(axis=1)
+    np.testing.assert_allclose(grid[index], there, atol=1e-12 * np.abs(grid).max())
+    column = [lp.column(i, k) for i, k in zip(lp.cells, index, strict=True)]
+    assert None not in column
+    np.testing.assert_allclose(Q[column], result.value[lp.cells], rtol=1e-9)
+
+
+# ------------------------------------------------------------------- every system, one by one
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_is_documented(name):
+    system = NAMED[name]
+    assert system.summary
+    assert system.source
+    assert system.__doc__
+    assert system.problem["system"]["kind"] == name
+    assert system.problem["name"]
+    # The file shows every parameter, so that a user sees what can be changed.
+    assert system.problem["system"]["parameters"] == system.defaults
+    problem = lm.Problem.model_validate(system.problem)
+    assert lm.Problem.model_validate(problem.to_dict()) == problem
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_is_solved_and_verified(name):
+    result = solved(name)
+    attractor, stabilizable, share = EXPECTED[name]
+    assert result.status == "verified", result.message
+    assert result.certificate.verified
+    assert result.gap <= 1e-9
+    assert result.attractor_cells == attractor
+    # A few samples lie within rounding of an edge, so counts may differ between platforms.
+    assert abs(result.stabilizable_cells - stabilizable) <= 0.005 * result.cells
+    assert result.stabilizable_cells >= share * (result.cells - attractor)
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_true_map_is_brought_to_the_attractor(name):
+    run = solved(name).simulate(starts=2000, steps=5000, seed=1)
+    assert run.reached > 0.99 * run.starts, run
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_unknown_parameter_is_refused(name):
+    system = {**NAMED[name].problem["system"], "parameters": {"nonsense": 1.0}}
+    with pytest.raises(lm.BadInput, match="is not a parameter of"):
+        variant(name, system=system)
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_parameters_reach_the_formulas(name):
+    """Changing any one parameter changes some image."""
+    base = NAMED[name].problem["system"]
+    rng = np.random.default_rng(0)
+    before = images(variant(name), *draw(name, 20, rng))
+    for key, value in NAMED[name].defaults.items():
+        rng = np.random.default_rng(0)
+        parameters = {**base["parameters"], key: 1.1 * value}
+        after = images(
+            variant(name, system={**base, "parameters": parameters}), *draw(name, 20, rng)
+        )
+        assert np.abs(after - before).max() > 1e-6, key
+
+
+# ------------------------------------------------------------ formulas against independent ones
+
+
+def draw(name, count, rng):
+    """Random states in the box, shape (d, count), and one control within its bounds."""
+    problem = variant(name)
+    axes = problem.state_box.values()
+    x = np.array([rng.uniform(a.low, a.high, count) for a in axes])
+    (u,) = problem.control_grid.values()
+    return x, rng.uniform(u.low, u.high, count)
+
+
+def images(problem, x, u):
+    values = dict(zip(problem.states, x, strict=True)) | {problem.controls[0]: u}
+    return np.array(problem.step()(values))
+
+
+def standard_map(s, u):
+    x, y = s
+    y = y + 0.25 * u * np.sin(2 * np.pi * x)  # the usual order: first the kick, then the drift
+    return np.array([x + y, y])
+
+
+def logistic_map(s, u):
+    return 3.9 * (s - s**2) + u
+
+
+def henon_map(s, u):
+    return np.array([1 + s[1] - 1.4 * np.square(s[0]) + u, 0.3 * s[0]])
+
+
+@pytest.mark.parametrize("by_hand", [standard_map, logistic_map, henon_map])
+def test_map_agrees_with_one_written_by_hand(by_hand):
+    x, u = draw(by_hand.__name__, 200, np.random.default_rng(3))
+    image = images(variant(by_hand.__name__), x, u)
+    np.testing.assert_allclose(image, by_hand(x, u), rtol=1e-12, atol=1e-12)
+
+
+def double_integrator(s, u):
+    return [s[1], u]
+
+
+def inverted_pendulum(s, u):
+    # Moment of inertia times angular acceleration = gravity's moment + motor - friction.
+    return [s[1], (1.0 * 9.81 * 1.0 * np.sin(s[0]) + u - 0.1 * s[1]) / (1.0 * 1.0**2)]
+
+
+def pendulum_on_cart(s, u):
+    """Lagrange's equations of cart and uniform rod, solved for both accelerations.
+
+    (M + m) x'' + m l (phi'' cos phi - phi'^2 sin phi) = u along the track,
+    4/3 m l^2 phi'' + m l x'' cos phi = m g l sin phi about the pivot,
+    with x to the right and phi clockwise.
+    """
+    m, M, length, g = 2.0, 8.0, 0.5, 9.8
+    phi, omega = s
+    mass = [[M + m, m * length * np.cos(phi)], [m * length * np.cos(phi), 4 / 3 * m * length**2]]
+    force = [u + m * length * omega**2 * np.sin(phi), m * g * length * np.sin(phi)]
+    return [omega, np.linalg.solve(mass, force)[1]]
+
+
+def van_der_pol(s, u):
+    return [s[1], u - s[0] + (1 - s[0]) * (1 + s[0]) * s[1]]
+
+
+def lorenz(s, u):
+    x, y, z = s
+    return [10 * y - 10 * x, 28 * x + u * x - x * z - y, x * y - 8 * z / 3]
+
+
+@pytest.mark.parametrize(
+    "by_hand", [double_integrator, inverted_pendulum, pendulum_on_cart, van_der_pol, lorenz]
+)
+def test_sampled_flow_agrees_with_an_integrator(by_hand):
+    """The right-hand side is right, and RK4's error is small against a cell."""
+    problem = variant(by_hand.__name__)
+    x, u = draw(by_hand.__name__, 60, np.random.default_rng(4))
+    image = images(problem, x, u)
+    system = problem.system
+    duration = system.step if hasattr(system, "step") else system.constants()["h"]
+    exact = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-10}
+    true = np.empty_like(x)
+    for i in range(x.shape[1]):
+        flow = solve_ivp(lambda t, s, u=u[i]: by_hand(s, u), (0, duration), x[:, i], **exact)
+        true[:, i] = flow.y[:, -1]
+    width = np.array([(a.high - a.low) / a.cells for a in problem.state_box.values()])
+    error = np.abs(image - true) / width[:, None]
+    assert error.max() < 0.02
+    # A wrong coefficient shows in the bulk of the points, far above the integrator's error.
+    assert np.median(error) < 1e-3
+
+
+# ------------------------------------------------------------------------------ standard map
+
+
+def shift(array):
+    """The value at (x + 1/2, y): 25 cells further."""
+    return np.roll(array, -25, axis=0)
+
+
+def test_standard_map_symmetry():
+    """(x, y, u) -> (x + 1/2, y, -u) is exact, so with a symmetric cost u is antisymmetric."""
+    result = lm.solve(variant("standard_map", stage_cost="1 + u**2"))
+    assert result.verified
+    assert_mirrored(result, -1, shift)
+    u = control(result)
+    has = ~np.isnan(u)
+    assert np.corrcoef(u[has], shift(u)[has])[0, 1] < -1 + 1e-9
+
+
+def test_standard_map_of_the_paper():
+    """The paper's cost breaks the symmetry: its control is antisymmetric only roughly."""
+    result = solved("standard_map")
+    assert (result.attractor_cells, result.stabilizable_cells) == (4, 2496)
+    assert result.pairs == 52416
+    u = control(result)
+    has = ~np.isnan(u)
+    assert -0.9 < np.corrcoef(u[has], shift(u)[has])[0, 1] < -0.6
+
+
+# ------------------------------------------------------------------------------ logistic, Henon
+
+
+def uncontrolled(name):
+    return variant(name, control_grid={"u": {"values": [0]}})
+
+
+def test_logistic_control_cancels_the_expansion():
+    """Next to the fixed point x* the control is that of Ott, Grebogi and Yorke.
+
+    There x+ - x* = (2 - r)(x - x*) + u, and u = (r - 2)(x - x*) cancels the growth.
+    """
+    result = solved("logistic_map")
+    (x,), u = centres(result), control(result)
+    fixed = 1 - 1 / 3.9
+    assert result.partition.locate([np.array(fixed)]) in np.flatnonzero(
+        result.cell_status == ATTRACTOR
+    )
+    near = (np.abs(x - fixed) < 0.0125) & ~np.isnan(u)
+    assert near.sum() == 3
+    np.testing.assert_allclose(u[near], 1.9 * (x[near] - fixed), atol=0.0055)
+
+
+def test_logistic_control_beats_waiting():
+    """Left alone, a chaotic orbit enters the attractor cells too, but some fifty times later."""
+    controlled = solved("logistic_map").simulate(2000, 5000)
+    left_alone = lm.solve(uncontrolled("logistic_map")).simulate(2000, 5000)
+    assert left_alone.reached > 0.99 * 2000
+    assert left_alone.steps["q50"] > 20 * controlled.steps["q50"]
+
+
+@pytest.mark.parametrize("name", ["logistic_map", "henon_map"])
+def test_control_is_zero_where_the_free_orbit_arrives_in_one_step(name):
+    """The cheapest conceivable cost is one free step: 1."""
+    result = solved(name)
+    lp = result.lp
+    zero = int(np.flatnonzero(lp.controls[:, 0] == 0)[0])
+    columns = [lp.column(i, zero) for i in lp.cells]
+    arrives = np.array(
+        [
+            k is not None
+            and (lp.rows.target[lp.rows.pointer[k] : lp.rows.pointer[k + 1]] == lp.n).all()
+            for k in columns
+        ]
+    )
+    assert arrives.any()
+    assert (result.control_index[lp.cells[arrives]] == zero).all()
+    np.testing.assert_allclose(result.value[lp.cells[arrives]], 1, rtol=1e-9)
+    assert (result.value[lp.cells[~arrives]] > 1).all()
+
+
+def test_henon_control_cancels_the_expansion():
+    """At the saddle x+ - x* = -2 a x* dx + dy + u: near it, u is about 2 a x* dx - dy."""
+    result = solved("henon_map")
+    (x, y), u = centres(result), control(result)
+    fixed = (-0.7 + np.sqrt(0.7**2 + 4 * 1.4)) / 2.8
+    dx, dy = x - fixed, y - 0.3 * fixed
+    assert result.cell_status[result.partition.locate([fixed, 0.3 * fixed])] == ATTRACTOR
+    near = ~np.isnan(u) & (np.abs(dx) < 0.08) & (np.abs(dy) < 0.03)
+    wanted = np.clip(2.8 * fixed * dx - dy, -0.1, 0.1)[near]
+    assert near.sum() >= 10
+    assert np.corrcoef(u[near], wanted)[0, 1] > 0.95
+    assert np.abs(u[near] - wanted).max() < 0.045
+
+
+def test_henon_needs_its_control():
+    """Without it hardly a cell can be kept from escaping to infinity (in the finite model)."""
+    assert lm.solve(uncontrolled("henon_map")).stabilizable_cells < 100
+
+
+# ------------------------------------------------------------------------------ double integrator
+
+
+def turn(array):
+    """The value at -x."""
+    return array[::-1, ::-1]
+
+
+ODD = ["double_integrator", "inverted_pendulum", "pendulum_on_cart", "van_der_pol"]
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_control_is_odd(name):
+    """The dynamics are unchanged by (x, u) -> (-x, -u): so is the optimum, up to ties."""
+    result = solved(name)
+    assert_mirrored(result, -1, turn)
+    u = control(result)
+    has = ~np.isnan(u)
+    assert np.corrcoef(u[has], turn(u)[has])[0, 1] < -0.95
+
+
+def test_double_integrator_is_bang_bang():
+    """Full thrust towards the switching curve x = -v |v| / 2, away from the limit on v."""
+    result = solved("double_integrator")
+    (x, v), u = centres(result), control(result)
+    side = x + v * np.abs(v) / 2
+    clear = ~np.isnan(u) & (np.abs(side) > 0.2) & (np.abs(v) < 1)
+    assert clear.sum() > 2500
+    assert np.mean(u[clear] == -np.sign(side[clear])) > 0.95
+    assert np.mean(u[clear] * side[clear] < 0) > 0.99
+
+
+def test_double_integrator_takes_the_minimum_time():
+    """The value is the classical v + 2 sqrt(v^2/2 + x), but for one sampling time and the cells."""
+    result = solved("double_integrator")
+    (x, v), value = centres(result), on_grid(result, result.value)
+    s = np.where(x + v * np.abs(v) / 2 > 0, 1, -1)
+    least = s * v + 2 * np.sqrt(np.maximum(v**2 / 2 + s * x, 0))
+    inside = on_grid(result, result.cell_status) == 1
+    late = (value - least)[inside]
+    assert np.corrcoef(value[inside], least[inside])[0, 1] > 0.995
+    assert 0 < np.median(late) < 0.2
+    assert np.abs(late).max() < 0.3
+
+
+def test_double_integrator_loses_what_cannot_brake():
+    """Exactly the states that full braking cannot stop before the wall are lost."""
+    result = solved("double_integrator")
+    x, v = centres(result)
+    stopping = np.abs(x + v * np.abs(v) / 2)  # where full braking comes to rest
+    towards_wall = x * v > 0
+    kept = on_grid(result, result.cell_status) <= 1
+    assert not (kept & towards_wall & (stopping > 2)).any()
+    assert kept[~towards_wall & (np.abs(v) < 1.25)].all()
+    assert kept[towards_wall & (stopping < 1.8)].all()
+
+
+# ------------------------------------------------------------------------------ pendulums
+
+
+def test_weak_motor_pumps_energy():
+    """Near the bottom, below the energy of the upright, the torque pushes along the motion."""
+    result = solved("inverted_pendulum")
+    (theta, omega), u = centres(result), control(result)
+    energy = omega**2 / 2 + 9.81 * (np.cos(theta) - 1)  # 0 upright at rest
+    low = ~np.isnan(u) & (np.abs(theta) > 3 * np.pi / 4) & (energy < 0)
+    swinging = low & (np.abs(omega) > 1)
+    assert swinging.sum() > 500
+    assert np.mean((u * omega)[swinging] > 0) > 0.99
+    assert np.mean((u * omega)[low] >= 0) > 0.93
+
+
+def test_weak_motor_catches_only_what_it_can():
+    """Of the unstable mode z = sqrt(g/l) theta + omega the motor can undo |z| < u / sqrt(g/l)."""
+    result = solved("inverted_pendulum")
+    (theta, omega), u = centres(result), control(result)
+    value = on_grid(result, result.value)
+    mode = np.sqrt(9.81) * theta + omega
+    upright = ~np.isnan(u) & (np.abs(theta) < 0.6)
+    catchable = upright & (np.abs(mode) < 0.8)
+    assert (u * mode <= 0)[catchable].all()
+    assert (u * mode < 0)[catchable & (np.abs(mode) > 0.25)].all()
+    # Beyond 3 / sqrt(9.81) = 0.96 it falls, and has to come round again.
+    assert value[upright & (np.abs(mode) > 1.5)].min() > 2 * value[catchable].max()
+
+
+def test_weak_motor_swings_up_from_rest():
+    """The hanging pendulum reaches the upright, and not without swinging back and forth."""
+    result = solved("inverted_pendulum")
+    path = result.closed_loop.path([np.pi - 0.05, 0.05], 500)
+    assert result.cell_status[result.partition.locate(list(path[-1:].T))] == ATTRACTOR
+    assert np.count_nonzero(np.diff(np.sign(path[:, 1]))) >= 3
+
+
+def test_cart_moves_under_the_falling_pendulum():
+    """Falling to phi > 0, the cart is pushed with u > 0 (or left, where a swing is cheaper)."""
+    result = solved("pendulum_on_cart")
+    (phi, omega), u = centres(result), control(result)
+    falling = ~np.isnan(u) & (np.abs(phi) < 1) & (phi * omega >= 0) & (np.abs(omega) < 2)
+    assert falling.sum() > 30
+    assert (u * phi >= 0)[falling].all()
+    assert (u * phi > 0)[falling & (np.abs(phi) < 0.5) & (np.abs(omega) < 0.5)].all()
+
+
+def test_cart_value_grows_away_from_the_upright():
+    """The least value over omega grows with |phi|; hanging is worst among rest within one turn."""
+    result = solved("pendulum_on_cart")
+    value = on_grid(result, result.value)
+    best = np.where(np.isfinite(value), value, np.inf).min(axis=1)[32:]  # phi > 0
+    assert best[0] == 0
+    running = np.maximum.accumulate(best)
+    assert (best >= 0.95 * running).all()
+    assert best[-1] > 3 * best[1]
+    rest = value[32:57, 31:33].mean(axis=1)  # phi from 0 to 2 pi, omega next to 0
+    assert np.abs((np.argmax(rest) + 0.5) / 4 - np.pi) < 0.5
+
+
+# ------------------------------------------------------------------------------ oscillator, Lorenz
+
+
+def test_van_der_pol_cannot_rest_by_itself():
+    """Without control every orbit ends on the limit cycle: no cell surely reaches the origin.
+
+    Only next to the origin do the cells' coarseness and the slow spiral leave a chance.
+    """
+    result = lm.solve(uncontrolled("van_der_pol"))
+    assert result.status == "not_stabilizable"
+    assert result.stabilizable_cells == 0
+    x, v = centres(result)
+    trapped = on_grid(result, result.cell_status) == 3
+    assert trapped[(np.hypot(x, v) < 2) & (np.hypot(x, v) > 0.8)].all()
+
+
+def test_van_der_pol_control_brakes():
+    """Within the limit cycle the forcing takes energy out: u v < 0."""
+    result = solved("van_der_pol")
+    (x, v), u = centres(result), control(result)
+    within = ~np.isnan(u) & (np.hypot(x, v) < 1.5)
+    assert within.sum() > 400
+    assert np.mean((u * v)[within] <= 0) > 0.95
+    assert np.mean((u * v)[within] < 0) > 0.9
+
+
+def test_lorenz_target_is_steady_convection():
+    """C+ is an equilibrium of the formulas and lies within the attractor cells; so is not C-."""
+    result = solved("lorenz")
+    c = np.sqrt(8 / 3 * 27)
+    plus, minus = np.array([c, c, 27.0]), np.array([-c, -c, 27.0])
+    for point in (plus, minus):
+        image = images(result.problem, point, np.array(0.0))
+        np.testing.assert_allclose(image, point, atol=1e-12)
+    status = [result.cell_status[result.partition.locate(list(p))] for p in (plus, minus)]
+    assert status == [ATTRACTOR, 1]
+
+
+def test_lorenz_symmetry():
+    """(x, y, z) -> (-x, -y, z) is a symmetry once both C+ and C- count as targets."""
+    target = NAMED["lorenz"].problem["attractor"]["boxes"][0]
+    mirror = {"x": [-10, -6], "y": [-12, -6], "z": target["z"]}
+    result = lm.solve(
+        variant(
+            "lorenz",
+            attractor={"boxes": [target, mirror]},
+            sampling={"kind": "grid", "per_axis": 2},
+        )
+    )
+    assert result.verified
+    assert_mirrored(result, 1, lambda array: array[::-1, ::-1, :])
+
+
+def test_lorenz_control_beats_waiting():
+    """A free orbit visits C+ too, after hundreds of steps; adjusting the heating takes a dozen."""
+    controlled = solved("lorenz").simulate(1000, 500)
+    assert controlled.steps["q99"] < 50
+    left_alone = lm.solve(uncontrolled("lorenz")).simulate(1000, 200)
+    assert left_alone.reached < 0.5 * left_alone.starts
+
+
+# ------------------------------------------------------------------------------ examples
+
+
+@pytest.mark.parametrize("name", [name for name in NAMED if name != "standard_map"])
+def test_example_file_is_the_default_problem(name):
+    path = EXAMPLES / f"{name}.json"
+    assert json.loads(path.read_text()) == NAMED[name].problem
+    assert lm.load(path) == lm.Problem.model_validate(NAMED[name].problem)
+
+
+def test_standard_map_file_spells_the_named_system_out():
+    """The file writes the formulas down, the system of that name knows them: one model."""
+    path = EXAMPLES / "standard_map.json"
+    written, known = json.loads(path.read_text()), NAMED["standard_map"].problem
+    assert written["system"]["next"] == NAMED["standard_map"].formulas
+    assert {**written, "system": 0} == {**known, "system": 0}
+    assert lm.compile(lm.load(path)).digest == lm.compile(variant("standard_map")).digest
+
+
+def test_there_is_one_example_per_system():
+    assert {path.stem for path in EXAMPLES.glob("*.json")} >= set(NAMED)
+
+
+@pytest.mark.parametrize("script", ["standard_map", "pendulum_swing_up", "own_function"])
+def test_example_script_runs(script, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", [script])
+    runpy.run_path(str(EXAMPLES / f"{script}.py"), run_name="__main__")
+    assert "verified" in capsys.readouterr().out
