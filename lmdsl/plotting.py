@@ -48,14 +48,14 @@ def portrait(
     *,
     axes: Sequence[str] | None = None,
     at: At | None = None,
-    starts: int = 12,
-    steps: int = 300,
+    starts: int | None = None,
+    steps: int | None = None,
 ) -> Axes:
     """Draw the phase portrait of the true map at a constant control.
 
-    A grid of initial states is followed, one colour per height of the start: dots for a map,
-    lines for a differential equation. In one dimension: the graph of the map, the diagonal and a
-    cobweb. Noise is held at its mean; a run ends where it leaves the box.
+    Initial states, one in each tile of a grid, are followed, coloured by the height of the start:
+    dots for a map, lines for a differential equation. In one dimension: the graph of the map, the
+    diagonal and a cobweb. Noise is held at its mean; a run ends where it leaves the box.
 
     Parameters
     ----------
@@ -69,36 +69,45 @@ def portrait(
     axes, at
         Which axes are shown and where the others are held.
     starts, steps
-        Initial states per axis, and steps of each.
+        Initial states per axis, and steps of each; None picks what reads well.
 
     Returns
     -------
     matplotlib.axes.Axes
     """
     given = problem if isinstance(problem, Problem) else problem.problem
+    for name, count in (("starts", starts), ("steps", steps)):
+        if count is not None and count < 1:
+            raise BadInput(f"{count} is not a positive number", name)
     partition = Partition.of(given)
     attractor = Regions.of(given, partition).attractor
     view = View.of(partition, attractor, axes, at)
-    u = _control_vector(given, control)
+    u = runs.control_vector(given, control)
+    lines = runs.is_ode(given)
     held = ", ".join(f"{plain(k, 16)} = {v:.3g}" for k, v in u.items())
-    word = "flow" if _is_ode(given) else "map"
-    ax = canvas.frame(ax, view, f"{word} at {held}{view.note}" if held else f"{word}{view.note}")
+    title = ("flow" if lines else "map") + (f" at {held}" if held else "") + view.note
+    drawn = layers.frame(ax, view, title)
+    layers.region(drawn, view, view.shadow(attractor), CellStatus.ATTRACTOR)
     if len(view.axes) == 1:
-        if partition.dimension > 1:
+        if view.hidden:
             raise BadInput("a phase portrait needs two axes", "axes")
-        _cobweb(ax, given, view, u)
-        canvas.region(ax, view, view.slice(attractor), CellStatus.ATTRACTOR)
-        return ax
-    base = partition.low + (view.cell + 0.5) * partition.width
-    grid = np.stack(np.meshgrid(*[(np.arange(starts) + 0.5) / starts] * 2), axis=-1).reshape(-1, 2)
-    x = np.tile(base, (len(grid), 1))
+        low, high = view.ends(0)
+        x = np.linspace(low, high, 2001)
+        image = runs.constant_map(given)(x[:, None], np.tile(list(u.values()), (len(x), 1)))[:, 0]
+        first = np.array([[low + 0.1234 * (high - low)]])
+        orbit = runs.open_loop(given, partition, first, u, steps or 60, fine=False)[:, 0, 0]
+        layers.graph(drawn, view, x, image, orbit)
+        return drawn
+    side = starts or (8 if lines else 14)
+    grid = np.stack(np.meshgrid(*[np.arange(side)] * 2), axis=-1).reshape(-1, 2)
+    place = (grid + np.random.default_rng(0).random(grid.shape)) / side
+    first = np.tile(partition.low + (view.cell + 0.5) * partition.width, (len(place), 1))
     shown_axes = list(view.axes)
     span = (partition.high - partition.low)[shown_axes]
-    x[:, shown_axes] = partition.low[shown_axes] + grid * span
-    points = _orbits(given, partition, x, u, steps)
-    _draw_orbits(ax, view, points, grid[:, 1], _is_ode(given))
-    canvas.region(ax, view, view.shadow(attractor), CellStatus.ATTRACTOR, above=True)
-    return ax
+    first[:, shown_axes] = partition.low[shown_axes] + place * span
+    points = runs.open_loop(given, partition, first, u, steps or (60 if lines else 300), fine=lines)
+    layers.orbits(drawn, view, points, place[:, 1], lines)
+    return drawn
 
 
 def cost(
@@ -131,12 +140,12 @@ def cost(
     view = _view(result, axes, at)
     solved = result.status != "not_stabilizable"
     word = "optimal cost" if result.verified else "cost, not verified" if solved else "causes"
-    ax = canvas.frame(ax, view, word + view.note)
+    drawn = layers.frame(ax, view, word + view.note)
     value = view.slice(_on_stabilized(result, result.value))
     if np.isfinite(value).any():
-        canvas.scalar(ax, view, value, "cost-to-go V", "viridis")
-    canvas.regions(ax, view, view.slice(_codes(result)), legend)
-    return ax
+        layers.scalar(drawn, view, value, "cost-to-go V", "viridis")
+    layers.regions(drawn, view, view.slice(_codes(result)), legend)
+    return drawn
 
 
 def control(
@@ -182,16 +191,16 @@ def control(
         )
     k = names.index(chosen)
     view = _view(result, axes, at)
-    ax = canvas.frame(ax, view, f"control {plain(chosen, 24)}{view.note}")
+    drawn = layers.frame(ax, view, f"control {plain(chosen, 24)}{view.note}")
     index = view.slice(result.control_index)
     if (index >= 0).any():
         values = np.where(index >= 0, result.control_vectors[index, k], np.nan)
         grid = control_values(result.problem)[k]
-        canvas.levels(ax, view, values, grid, f"control {plain(chosen, 24)}")
+        layers.levels(drawn, view, values, grid, f"control {plain(chosen, 24)}")
     elif (result.control_index < 0).all():
-        canvas.remark(ax, "no controller")
-    canvas.regions(ax, view, view.slice(_codes(result)), legend)
-    return ax
+        layers.remark(drawn, "no controller")
+    layers.regions(drawn, view, view.slice(_codes(result)), legend)
+    return drawn
 
 
 def measure(
@@ -220,14 +229,14 @@ def measure(
     matplotlib.axes.Axes
     """
     view = _view(result, axes, at)
-    ax = canvas.frame(ax, view, "Lyapunov measure" + view.note)
+    drawn = layers.frame(ax, view, "Lyapunov measure" + view.note)
     if result.measure.any():
         values = view.slice(_on_stabilized(result, result.measure))
-        canvas.scalar(ax, view, values, "Lyapunov measure", "cividis")
+        layers.scalar(drawn, view, values, "Lyapunov measure", "cividis")
     else:
-        canvas.remark(ax, "no Lyapunov measure")
-    canvas.regions(ax, view, view.slice(_codes(result)), legend)
-    return ax
+        layers.remark(drawn, "no Lyapunov measure")
+    layers.regions(drawn, view, view.slice(_codes(result)), legend)
+    return drawn
 
 
 def trajectories(
@@ -268,31 +277,30 @@ def trajectories(
     matplotlib.axes.Axes
     """
     view = _view(result, axes, at)
-    ax = canvas.frame(ax, view, "closed loop")
+    drawn = layers.frame(ax, view, "closed loop")
     status = result.cell_status
     attractor = view.shadow(status == CellStatus.ATTRACTOR)
     code = np.where(attractor, np.uint8(CellStatus.ATTRACTOR), np.uint8(CellStatus.STABILIZED))
     if not view.hidden:
         code = view.slice(_codes(result))
     if (result.control_index < 0).all() or not result.weight.any():
-        canvas.remark(ax, "no controller")
-        canvas.regions(ax, view, code, legend)
-        return ax
-    x = _starts(result, starts, seed)
-    points, last = _closed_loop(result, x, steps, seed)
+        layers.remark(drawn, "no controller")
+        layers.regions(drawn, view, code, legend)
+        return drawn
+    x = runs.starts_of(result, starts, seed)
+    points, last, pieces = runs.closed_loop(result, x, steps, seed)
     reached = (last >= 0) & (status[last] == CellStatus.ATTRACTOR)
     running = (last >= 0) & (status[last] == CellStatus.STABILIZED)
-    ax.set_title(f"closed loop, {int(reached.sum())} of {len(x)} runs reach A", fontsize=11)
+    drawn.set_title(f"closed loop, {int(reached.sum())} of {len(x)} runs reach A", fontsize=11)
     if len(view.axes) == 1:
-        ax.set_xlabel("step")
-        ax.set_ylabel(view.label(0))
-        ax.set_xlim(-0.5, len(points) - 0.5)
-        ax.set_ylim(*view.ends(0))
-        _bands(ax, view, code)
-    else:
-        canvas.regions(ax, view, code, legend)
-    _draw_runs(ax, view, points, reached, ~reached & ~running, _is_ode(result.problem))
-    return ax
+        drawn.set_xlabel("step")
+        drawn.set_ylabel(view.label(0))
+        drawn.set_xlim(-0.4, (len(points) - 1) / pieces + 0.4)
+        drawn.set_ylim(*view.ends(0))
+    layers.regions(drawn, view, code, legend, upright=False)
+    lines = runs.is_ode(result.problem)
+    layers.runs(drawn, view, points, reached, ~reached & ~running, lines, pieces)
+    return drawn
 
 
 def figure(
@@ -342,7 +350,7 @@ def figure(
     draw.append(lambda ax: _numbers(ax, result))
     columns = min(len(draw), 4 if len(draw) in (7, 8) else 3)
     rows = -(-len(draw) // columns)
-    page = canvas.blank(columns, rows)
+    page = layers.blank(columns, rows)
     page.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
     for k, panel in enumerate(draw):
         panel(page.add_subplot(rows, columns, k + 1))
@@ -371,13 +379,13 @@ def _codes(result: Result) -> NDArray[np.uint8]:
     code = result.cell_status.copy()
     free = code == CellStatus.STABILIZED
     if result.status == "not_stabilizable":
-        code[free] = canvas.UNSOLVED
+        code[free] = layers.UNSOLVED
         if result.cause == "gamma":
-            code[free & (result.witness > 0)] = canvas.INFINITE
+            code[free & (result.witness > 0)] = layers.INFINITE
     return code
 
 
-def _numbers(ax: Axes, result: Result) -> None:
+def _numbers(ax: Any, result: Result) -> None:
     """Write the status and the key numbers."""
 
     def number(value: float | None) -> str:
@@ -391,8 +399,9 @@ def _numbers(ax: Axes, result: Result) -> None:
         ("cost", number(result.cost)),
         ("lower bound", number(result.lower_bound)),
         ("gap", "unknown" if result.gap is None else f"{result.gap:.1e}"),
+        ("contraction", number(result.contraction)),
         ("cells", cells),
-        ("attractor", f"{result.attractor_cells} cells"),
+        ("attractor", f"{result.attractor_cells} cell{'s' if result.attractor_cells != 1 else ''}"),
         ("controls", number(result.controls)),
     ]
     ax.set_axis_off()

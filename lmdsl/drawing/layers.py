@@ -81,7 +81,9 @@ def region(
     name, colour, hatch = REGIONS[code]
     flat = len(view.axes) == 1
     across = np.array([0.0, 1.0])
-    boxes = rectangles(mask.reshape(len(mask), -1), view.edges(0), across if flat else view.edges(1))
+    boxes = rectangles(
+        mask.reshape(len(mask), -1), view.edges(0), across if flat else view.edges(1)
+    )
     place = ax.transData
     if flat:
         place = ax.get_xaxis_transform() if upright else ax.get_yaxis_transform()
@@ -120,12 +122,15 @@ def _ring(ax: Any, view: View, mask: Bools) -> None:
     ax.add_collection(LineCollection(lines, colors="white", linewidths=0.8, zorder=3.1))
     for part in find_objects(label(mask)[0])[:100]:
         if all((q.stop - q.start) < 0.03 * n for q, n in zip(part, mask.shape, strict=True)):
-            centre = [
-                (e[q.start] + e[q.stop]) / 2 for e, q in zip((x, y), part, strict=True)
-            ]
+            centre = [(e[q.start] + e[q.stop]) / 2 for e, q in zip((x, y), part, strict=True)]
             for colour, width in (("white", 2.4), (ATTRACTOR, 1.3)):
                 ax.scatter(
-                    *centre, s=75, facecolors="none", edgecolors=colour, linewidths=width, zorder=3.2
+                    *centre,
+                    s=75,
+                    facecolors="none",
+                    edgecolors=colour,
+                    linewidths=width,
+                    zorder=3.2,
                 )
 
 

@@ -82,13 +82,17 @@ def into_box(partition: Partition, x: Floats) -> Floats:
 
 
 def open_loop(
-    problem: Problem, partition: Partition, x: Floats, u: Mapping[str, float], steps: int
+    problem: Problem,
+    partition: Partition,
+    x: Floats,
+    u: Mapping[str, float],
+    steps: int,
+    fine: bool,
 ) -> Floats:
     """Return states of runs at a constant control, shape (T, r, d), NaN after leaving the box.
 
-    A step of a differential equation makes PIECES states.
+    With ``fine`` a step makes PIECES states.
     """
-    fine = is_ode(problem)
     image = constant_map(problem, fine)
     points = np.full((steps * (PIECES if fine else 1) + 1, *x.shape), np.nan)
     points[0] = x
