@@ -67,7 +67,9 @@ def refuse_unless_free(path: str | os.PathLike[str]) -> None:
                 )
         parent = _existing_parent(target)
         if not os.access(parent, os.W_OK | os.X_OK):
-            raise BadInput(f"cannot write in {shown(str(parent), 200)}; choose another place", "out")
+            raise BadInput(
+                f"cannot write in {shown(str(parent), 200)}; choose another place", "out"
+            )
     except (OSError, ValueError) as error:
         if isinstance(error, BadInput):
             raise
@@ -215,7 +217,7 @@ def load(path: str | os.PathLike[str]) -> Result:
     arrays = read_arrays(folder / "solution.npz", expected)
     vectors = control_vectors(problem)
     index = arrays["control_index"]
-    if index.size and not (-1 <= index.min() and index.max() < len(vectors)):
+    if index.size and not (index.min() >= -1 and index.max() < len(vectors)):
         raise BadInput("control_index holds an index outside the control grid", "solution.npz")
     if arrays["cell_status"].max(initial=0) > 5:
         raise BadInput("cell_status holds an unknown code", "solution.npz")
@@ -236,9 +238,10 @@ def load(path: str | os.PathLike[str]) -> Result:
         reasons=tuple(stored["reasons"]),
     )
     bracket = stored["gamma_bar"]
+    known: dict[str, Any] = {**scalars, **arrays}
     return Result(
-        **scalars,
-        gamma_bar=tuple(float(x) for x in bracket) if bracket else None,
+        **known,
+        gamma_bar=(float(bracket[0]), float(bracket[1])) if bracket else None,
         seconds=Seconds(**stored["seconds"]),
         problem=problem,
         partition=partition,
@@ -248,7 +251,6 @@ def load(path: str | os.PathLike[str]) -> Result:
         gap_before_polish=stored["gap_before_polish"],
         cause=stored["cause"],
         model_sha256=stored["model_sha256"],
-        **arrays,
     )
 
 
@@ -259,7 +261,8 @@ def _problem(folder: Path) -> Problem:
         return parse_problem(data)
     # A function cannot be stored: everything but calling it still works.
     stand_in = FunctionSystem(next=_not_stored, parameters=system.get("parameters", {}))
-    return Problem.model_validate({**data, "system": stand_in})
+    problem: Problem = Problem.model_validate({**data, "system": stand_in})
+    return problem
 
 
 def _not_stored(**values: Any) -> Any:

@@ -80,7 +80,7 @@ def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDAr
 @njit(cache=True, nogil=True)
 def _improve(pair_pointer, pointer, target, code, share, cost, gamma, V, allowed, value, pair):  # type: ignore[no-untyped-def]
     for i in range(len(pair_pointer) - 1):
-        best, choice = np.inf, np.int64(-1)
+        best, choice = np.inf, -1
         for k in range(pair_pointer[i], pair_pointer[i + 1]):
             if len(allowed) and not allowed[k]:
                 continue

@@ -31,9 +31,7 @@ def expected_above(lp: StabilizationLP, pair: Pairs, x: Floats, gamma: float) ->
     """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
     upper = np.empty(lp.n)
     rows = lp.rows
-    _above(
-        pair, rows.pointer, rows.target, rows.code, rows.shares.value, gamma, padded(x), upper
-    )
+    _above(pair, rows.pointer, rows.target, rows.code, rows.shares.value, gamma, padded(x), upper)
     return upper
 
 
@@ -54,9 +52,7 @@ def add_above(a: Floats, b: Floats) -> Floats:
     return np.where((a == 0) | (b == 0), total, total * (1 + 4 * UNIT))
 
 
-def backup_below(
-    lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None
-) -> Floats:
+def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Floats:
     """Return a lower bound of min_a gamma P_a x + G_a, shape (n,); ``cost`` None means 0."""
     lower, rows = np.empty(lp.n), lp.rows
     _below(
@@ -74,9 +70,7 @@ def holds_for_all(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | N
     return all(exactly_below(lp, int(k), x, gamma, cost) for k in open_pairs)
 
 
-def undecided(
-    lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None
-) -> Pairs | None:
+def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Pairs | None:
     """Return the pairs for which x <= gamma P_a x + G_a is not clear; None if too many."""
     found, rows = np.empty(MAX_EXACT, dtype=np.int64), lp.rows
     count = _open(

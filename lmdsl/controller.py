@@ -98,9 +98,7 @@ class Simulation:
 class ClosedLoop:
     """The true map under a controller: wraps, clips and judges like the compiled model."""
 
-    def __init__(
-        self, problem: Problem, controller: Controller, status: NDArray[np.uint8]
-    ) -> None:
+    def __init__(self, problem: Problem, controller: Controller, status: NDArray[np.uint8]) -> None:
         self.problem, self.controller, self.status = problem, controller, status
         self.partition = controller.partition
         self.map = problem.step()
@@ -192,9 +190,7 @@ def simulate(
     reached = int((outcome == REACHED).sum())
     quantiles = None
     if reached:
-        q = np.quantile(
-            taken[outcome == REACHED], [0, 0.5, 0.9, 0.99, 1], method="inverted_cdf"
-        )
+        q = np.quantile(taken[outcome == REACHED], [0, 0.5, 0.9, 0.99, 1], method="inverted_cdf")
         quantiles = dict(zip(("min", "q50", "q90", "q99", "max"), map(int, q), strict=True))
     return Simulation(
         starts=starts,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import numpy as np
 from pydantic import (
@@ -56,7 +56,7 @@ class FrozenDict(dict[_K, _V]):
         return (type(self), (dict(self),))
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Turn NumPy scalars and arrays, lists and mappings into what strict validation accepts."""
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
@@ -73,36 +73,42 @@ def _named(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-Number = Annotated[float, BeforeValidator(_plain), Field(allow_inf_nan=False, strict=True)]
+Number = Annotated[float, BeforeValidator(plain), Field(allow_inf_nan=False, strict=True)]
 """A finite double; booleans, strings, NaN and infinities are refused."""
 
-Count = Annotated[int, BeforeValidator(_plain), Field(strict=True, ge=1)]
+Count = Annotated[int, BeforeValidator(plain), Field(strict=True, ge=1)]
 """A whole number of at least 1."""
 
-Seed = Annotated[int, BeforeValidator(_plain), Field(strict=True, ge=0, lt=2**63)]
+Seed = Annotated[int, BeforeValidator(plain), Field(strict=True, ge=0, lt=2**63)]
 """A seed of a random generator."""
 
-Numbers = Annotated[tuple[Number, ...], BeforeValidator(_plain)]
+Numbers = Annotated[tuple[Number, ...], BeforeValidator(plain)]
 """A sequence of finite doubles."""
 
-_frozen_dict = AfterValidator(FrozenDict)
-_names = AfterValidator(_named)
+frozen_dict = AfterValidator(FrozenDict)
+valid_names = AfterValidator(_named)
 
-Parameters = Annotated[dict[str, Number], BeforeValidator(_plain), _names, _frozen_dict]
+Parameters = Annotated[dict[str, Number], BeforeValidator(plain), valid_names, frozen_dict]
 """Named constants of a system."""
 
-Formulas = Annotated[dict[str, str], BeforeValidator(_plain), _names, _frozen_dict]
+Formulas = Annotated[dict[str, str], BeforeValidator(plain), valid_names, frozen_dict]
 """One formula per state."""
 
-Interval = Annotated[tuple[Number, Number], BeforeValidator(_plain)]
-Box = Annotated[dict[str, Interval], BeforeValidator(_plain), _frozen_dict]
+Interval = Annotated[tuple[Number, Number], BeforeValidator(plain)]
+Box = Annotated[dict[str, Interval], BeforeValidator(plain), frozen_dict]
 """Axis name to ``[a, b]``; axes left out are unrestricted."""
 
 
-class _Meta(type(BaseModel)):  # type: ignore[misc]
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+
+
+class _Meta(ModelMetaclass):
     """Turns pydantic's report into one BadInput wherever a user constructs a model."""
 
-    def __call__(cls, *args: Any, **kwargs: Any) -> Any:
+    def __call__(cls, *args: Any, **kwargs: Any) -> Any:  # noqa: N805
         if args:
             raise BadInput(f"{cls.__name__} takes keyword arguments only")
         try:
@@ -114,7 +120,9 @@ class _Meta(type(BaseModel)):  # type: ignore[misc]
 class Declared(BaseModel, metaclass=_Meta):
     """Base model: unknown keys refused, no coercion, frozen, errors as :class:`BadInput`."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True
+    )
 
     @classmethod
     def model_validate(cls, obj: Any, **kwargs: Any) -> Any:

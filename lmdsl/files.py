@@ -1,4 +1,4 @@
-"""Files in and out: bounded reading of strict JSON, and writing that happens whole or not at all."""
+"""Files: bounded reading of strict JSON, and writing that happens whole or not at all."""
 
 from __future__ import annotations
 

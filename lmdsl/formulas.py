@@ -32,7 +32,6 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.errors import BadInput, shown
 

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -51,14 +52,14 @@ class Predecessors:
     """
 
     pointer: NDArray[np.int64]
-    pair: NDArray[np.integer]
+    pair: NDArray[Any]
 
     @classmethod
     def of(cls, rows: Rows) -> Predecessors:
         """Transpose the pattern of rows."""
-        kind = np.int32 if rows.count < 2**31 else np.int64
         pointer = np.zeros(rows.columns + 2, dtype=np.int64)
-        pair = np.empty(len(rows.target), dtype=kind)
+        small = rows.count < 2**31
+        pair = np.empty(len(rows.target), dtype=np.int32 if small else np.int64)
         _transpose(rows.pointer, rows.target, pointer, pair)
         return cls(pointer, pair)
 
@@ -174,9 +175,7 @@ def restrict(
 
 def owner(pair_pointer: NDArray[np.int64]) -> NDArray[np.int32]:
     """Return the cell of every pair, shape (pairs,)."""
-    return np.repeat(
-        np.arange(len(pair_pointer) - 1, dtype=np.int32), np.diff(pair_pointer)
-    )
+    return np.repeat(np.arange(len(pair_pointer) - 1, dtype=np.int32), np.diff(pair_pointer))
 
 
 @njit(cache=True, nogil=True)

@@ -96,9 +96,7 @@ class StabilizationLP:
         """(E - gamma P)', shape (n, K), a SciPy CSC array made anew on each call."""
         from scipy.sparse import csr_array
 
-        E = csr_array(
-            (np.ones(self.K), self.cell, np.arange(self.K + 1)), shape=(self.K, self.n)
-        )
+        E = csr_array((np.ones(self.K), self.cell, np.arange(self.K + 1)), shape=(self.K, self.n))
         return (E - self.gamma * self.P).T.tocsc()
 
     @property
@@ -123,7 +121,7 @@ class StabilizationLP:
 
     @property
     def growth(self) -> float:
-        """g = max(gamma, 1): the weight under which a policy must be stabilizing."""
+        """G = max(gamma, 1): the weight under which a policy must be stabilizing."""
         return max(self.gamma, 1.0)
 
     def column(self, cell: int, control: int) -> int | None:

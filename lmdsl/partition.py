@@ -9,7 +9,7 @@ simulation alike, so that they can never disagree about an edge.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -177,9 +177,7 @@ class Partition:
             block.append(np.arange(max(first, 0), min(last, n - 1) + 1))
         return tuple(block)
 
-    def inside_box(
-        self, box: Mapping[str, tuple[float, float]], where: str
-    ) -> tuple[Indices, ...]:
+    def inside_box(self, box: Mapping[str, tuple[float, float]], where: str) -> tuple[Indices, ...]:
         """Return the block of cells inside a box, up to 1e-9 widths."""
 
         def cells(ta: float, tb: float) -> tuple[float, float]:
@@ -199,7 +197,12 @@ class Partition:
 
         return self._block(box, where, cells)
 
-    def _block(self, box, where, cells):  # type: ignore[no-untyped-def]
+    def _block(
+        self,
+        box: Mapping[str, tuple[float, float]],
+        where: str,
+        cells: Callable[[float, float], tuple[float, float]],
+    ) -> tuple[Indices, ...]:
         block = []
         for k, name in enumerate(self.names):
             n = int(self.cells[k])
@@ -208,14 +211,13 @@ class Partition:
                 continue
             a, b = box[name]
             ta, tb = ((end - self.low[k]) / self.width[k] for end in (a, b))
-            if self.periodic[k] and not (-EDGE <= ta and tb <= n + EDGE):
+            if self.periodic[k] and not (ta >= -EDGE and tb <= n + EDGE):
                 raise BadInput(
                     f"[{a!r}, {b!r}] leaves the periodic axis [{float(self.low[k])!r}, "
                     f"{float(self.high[k])!r}]; use two boxes across the seam",
                     f"{where}.{name}",
                 )
-            ends = (min(max(t, -2.0), n + 2.0) for t in (ta, tb))
-            first, last = cells(*ends)
+            first, last = cells(*(min(max(float(t), -2.0), n + 2.0) for t in (ta, tb)))
             block.append(np.arange(max(int(first), 0), min(int(last), n - 1) + 1))
         return tuple(block)
 

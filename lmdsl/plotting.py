@@ -28,7 +28,7 @@ from lmdsl.graph import CellStatus
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.sampling import control_values
-from lmdsl.transitions import Regions
+from lmdsl.regions import Regions
 
 if TYPE_CHECKING:
     import os
@@ -86,7 +86,7 @@ def portrait(
     lines = runs.is_ode(given)
     held = ", ".join(f"{plain(k, 16)} = {v:.3g}" for k, v in u.items())
     title = ("flow" if lines else "map") + (f" at {held}" if held else "") + view.note
-    drawn = layers.frame(ax, view, title)
+    drawn: Axes = layers.frame(ax, view, title)
     layers.region(drawn, view, view.shadow(attractor), CellStatus.ATTRACTOR)
     if len(view.axes) == 1:
         if view.hidden:
@@ -107,6 +107,7 @@ def portrait(
     first[:, shown_axes] = partition.low[shown_axes] + place * span
     points = runs.open_loop(given, partition, first, u, steps or (60 if lines else 300), fine=lines)
     layers.orbits(drawn, view, points, place[:, 1], lines)
+    layers.outline(drawn, view, view.shadow(attractor), layers.ATTRACTOR)
     return drawn
 
 
@@ -140,7 +141,7 @@ def cost(
     view = _view(result, axes, at)
     solved = result.status != "not_stabilizable"
     word = "optimal cost" if result.verified else "cost, not verified" if solved else "causes"
-    drawn = layers.frame(ax, view, word + view.note)
+    drawn: Axes = layers.frame(ax, view, word + view.note)
     value = view.slice(_on_stabilized(result, result.value))
     if np.isfinite(value).any():
         layers.scalar(drawn, view, value, "cost-to-go V", "viridis")
@@ -191,7 +192,7 @@ def control(
         )
     k = names.index(chosen)
     view = _view(result, axes, at)
-    drawn = layers.frame(ax, view, f"control {plain(chosen, 24)}{view.note}")
+    drawn: Axes = layers.frame(ax, view, f"control {plain(chosen, 24)}{view.note}")
     index = view.slice(result.control_index)
     if (index >= 0).any():
         values = np.where(index >= 0, result.control_vectors[index, k], np.nan)
@@ -229,7 +230,7 @@ def measure(
     matplotlib.axes.Axes
     """
     view = _view(result, axes, at)
-    drawn = layers.frame(ax, view, "Lyapunov measure" + view.note)
+    drawn: Axes = layers.frame(ax, view, "Lyapunov measure" + view.note)
     if result.measure.any():
         values = view.slice(_on_stabilized(result, result.measure))
         layers.scalar(drawn, view, values, "Lyapunov measure", "cividis")
@@ -277,7 +278,7 @@ def trajectories(
     matplotlib.axes.Axes
     """
     view = _view(result, axes, at)
-    drawn = layers.frame(ax, view, "closed loop")
+    drawn: Axes = layers.frame(ax, view, "closed loop")
     status = result.cell_status
     attractor = view.shadow(status == CellStatus.ATTRACTOR)
     code = np.where(attractor, np.uint8(CellStatus.ATTRACTOR), np.uint8(CellStatus.STABILIZED))
@@ -350,8 +351,7 @@ def figure(
     draw.append(lambda ax: _numbers(ax, result))
     columns = min(len(draw), 4 if len(draw) in (7, 8) else 3)
     rows = -(-len(draw) // columns)
-    page = layers.blank(columns, rows)
-    page.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
+    page: Figure = layers.blank(columns, rows)
     for k, panel in enumerate(draw):
         panel(page.add_subplot(rows, columns, k + 1))
     page.suptitle(plain(result.problem.name, 100), fontsize=13)
@@ -408,7 +408,7 @@ def _numbers(ax: Any, result: Result) -> None:
     for k, (name, value) in enumerate(rows):
         y = 0.97 - 0.075 * k
         ax.text(0.02, y, name, transform=ax.transAxes, va="top", color="#666666")
-        ax.text(0.34, y, value, transform=ax.transAxes, va="top", color=INK)
+        ax.text(0.34, y, value, transform=ax.transAxes, va="top", color=layers.INK)
     message = textwrap.fill(plain(result.message, 300), 46)
     y = 0.97 - 0.075 * (len(rows) + 0.5)
-    ax.text(0.02, y, message, transform=ax.transAxes, va="top", fontsize=9, color=INK)
+    ax.text(0.02, y, message, transform=ax.transAxes, va="top", fontsize=9, color=layers.INK)

@@ -16,7 +16,7 @@ from lmdsl.errors import BadInput
 from lmdsl.graph import CellStatus
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.transitions import Regions
+from lmdsl.regions import Regions
 
 if TYPE_CHECKING:
     import os

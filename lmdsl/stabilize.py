@@ -18,6 +18,7 @@ from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.result import Result, Seconds
 from lmdsl.transitions import Progress
+from lmdsl.witness import certify
 
 TOLERANCE = 1e-6
 Pairs = NDArray[np.int64]
@@ -81,11 +82,12 @@ def solve(
     first = policy.stabilizing(lp, late)
     if isinstance(first, policy.Refused):
         verified = _refuse(lp, first, tolerance)
-        if verified.certificate.refusal:
+        w = verified.witness.w
+        if verified.certificate.refusal and w is not None:
             job.solve_seconds = time.perf_counter() - started
             message = (
                 f"gamma = {lp.gamma!r} is not below gamma_bar: proved that no control makes the "
-                f"cost finite from {int((verified.witness.w > 0).sum())} cells; "  # type: ignore[operator]
+                f"cost finite from {int((w > 0).sum())} cells; "
                 f"lower gamma (it works at {first.lower:.9g})"
             )
             bracket = (first.lower, lp.gamma)
@@ -112,18 +114,16 @@ def solve(
     if progress:
         progress("verify", -1.0)
     started = time.perf_counter()
-    verified = certificate.certify(lp, outcome.pair, tolerance, outcome.value)
+    verified = certify(lp, outcome.pair, tolerance, outcome.value)
     job.verify_seconds = time.perf_counter() - started
     undecided = isinstance(first, policy.Undecided) and not late()
     return job.solved(solution, outcome, verified, undecided)
 
 
-def _check_options(
-    tolerance: float, time_limit: float | None, max_iterations: int | None
-) -> None:
+def _check_options(tolerance: float, time_limit: float | None, max_iterations: int | None) -> None:
     if not 0 <= tolerance < np.inf:
         raise BadInput(f"{tolerance!r} must be a finite number >= 0", "tolerance")
-    if time_limit is not None and not 0 < time_limit:
+    if time_limit is not None and not time_limit > 0:
         raise BadInput(f"{time_limit!r} must be a number of seconds > 0", "time_limit")
     if max_iterations is not None and max_iterations < 1:
         raise BadInput(f"{max_iterations!r} must be at least 1", "max_iterations")
@@ -135,9 +135,7 @@ def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[str, str]
         return "empty", "no cell can be kept in the box and brought to the attractor"
     if not lp.weight.any():
         return "measure", "no cell of measure is stabilizable; enlarge its boxes"
-    outside = int((lp.cell_status >= CellStatus.ESCAPES).sum()) - int(
-        (lp.cell_status == CellStatus.AVOID).sum()
-    )
+    outside = lp.partition.size - lp.n - int(np.isin(lp.cell_status, (0, 5)).sum())
     if require_all and outside:
         return "require_all", f"{outside} cells outside A and Z are not stabilizable"
     return None
@@ -174,9 +172,7 @@ def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
     return None
 
 
-def _polish(
-    lp: StabilizationLP, solution: Solution, start: Pairs, tolerance: float
-) -> _Outcome:
+def _polish(lp: StabilizationLP, solution: Solution, start: Pairs, tolerance: float) -> _Outcome:
     """Improve a backend's policy exactly until nothing is strictly better, then break ties.
 
     A policy that is not g-stabilizing is discarded where gamma >= 1. After a limit the policy is
@@ -191,7 +187,7 @@ def _polish(
         return _Outcome(pair, value, 0, None)
     done = policy.iterate(lp, pair, value)
     if done.steps:
-        gap_before = certificate.certify(lp, pair, tolerance, value).certificate.gap
+        gap_before = certify(lp, pair, tolerance, value).certificate.gap
     tidy = policy.canonical(lp, done.pair, done.value)
     if (tidy == done.pair).all():
         return _Outcome(done.pair, done.value, done.steps, gap_before)

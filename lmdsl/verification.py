@@ -15,15 +15,18 @@ from typing import Any
 import numpy as np
 
 from lmdsl import archive
-from lmdsl.certificate import Certificate, Witness, check
+from lmdsl.certificate import CLAIMS, Certificate, Witness, check
 from lmdsl.errors import BadInput
 from lmdsl.graph import CellStatus
 from lmdsl.lp import StabilizationLP, compile
-from lmdsl.result import Result
+from lmdsl.regions import Regions
+from lmdsl.result import Result, jsonable
 from lmdsl.rows import Rows, Shares
 from lmdsl.sampling import noise_nodes, sample_points
 from lmdsl.systems import FunctionSystem
-from lmdsl.transitions import Progress, Regions
+from lmdsl.transitions import Progress
+
+LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
 
 
 @dataclass(frozen=True)
@@ -55,16 +58,12 @@ class Verification:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        from lmdsl.result import jsonable
-
         proof = self.certificate
         return {
             "holds": self.holds,
             "status": self.status,
             "same_model": self.same_model,
-            "claims": {
-                name: getattr(proof, name) for name in (*archive.CLAIMS, "refusal")
-            },
+            "claims": {name: getattr(proof, name) for name in (*CLAIMS, "refusal")},
             "cost": jsonable(proof.cost),
             "lower_bound": jsonable(proof.lower),
             "gap": jsonable(proof.gap),
@@ -109,9 +108,7 @@ def verify(path: str | os.PathLike[str], progress: Progress | None = None) -> Ve
         certificate = _judge_claims(lp, result, reasons)
         if result.status != "verified":
             reasons.append(f"the status is {result.status}, not verified")
-    return Verification(
-        not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
-    )
+    return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
 
 
 def _judge_claims(lp: StabilizationLP, result: Result, reasons: list[str]) -> Certificate:
@@ -162,11 +159,7 @@ def _judge_refusal(lp: StabilizationLP, result: Result, reasons: list[str]) -> C
     proved = {
         "empty": not lp.n,
         "measure": bool(lp.n) and not lp.weight.any(),
-        "require_all": bool(
-            (
-                (lp.cell_status >= CellStatus.ESCAPES) & (lp.cell_status <= CellStatus.LEADS_TO_THESE)
-            ).any()
-        ),
+        "require_all": bool(np.isin(lp.cell_status, LOST).any()),
         "gamma": certificate.refusal,
     }
     if not proved.get(result.cause or "", False):
@@ -206,9 +199,7 @@ def _stored_model(folder: Path, result: Result) -> StabilizationLP:
     entries = int(small["pointer"][-1])
     if not 0 <= entries <= K * points * len(nodes.weights):
         raise BadInput("pointer is out of range", "model.npz")
-    large = archive.read_arrays(
-        path, {"target": ((entries,), "<i4"), "code": ((entries,), "<u4")}
-    )
+    large = archive.read_arrays(path, {"target": ((entries,), "<i4"), "code": ((entries,), "<u4")})
     shares = Shares.of(points, nodes)
     rows = Rows(
         small["pointer"],

@@ -42,7 +42,7 @@ def random_lp(
         for a in range(per_cell[i]):
             support = rng.integers(0, cells, size=rng.integers(1, spread + 1))
             hits = rng.choice(support, size=samples)
-            if a == 0 and rng.random() < 0.9 or rng.random() < 0.3:
+            if (a == 0 and rng.random() < 0.9) or rng.random() < 0.3:
                 hits[rng.random(samples) < absorb] = cells
             if a == 0 and i == 0:
                 hits[0] = cells

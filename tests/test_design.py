@@ -24,9 +24,11 @@ declared
 systems.base
 systems.*
 systems
+declarations
 problem
 sampling memory
 partition rows
+regions
 transitions
 graph
 lp
@@ -38,12 +40,14 @@ backends.scaled
 backends
 backends.*
 certificate
+witness
 controller
 result
 archive
 stabilize
 comparison verification
-canvas
+drawing drawing.view
+drawing.*
 plotting
 cli
 __main__

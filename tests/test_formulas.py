@@ -15,16 +15,15 @@ from hypothesis import strategies as st
 
 from lmdsl import formulas
 from lmdsl.errors import BadInput
-from lmdsl.program import Program
 from lmdsl.formulas import (
     FORMULA_CONSTANTS,
     FORMULA_FUNCTIONS,
     Formula,
     FormulaError,
-
     check_name,
     parse,
 )
+from lmdsl.program import Program
 
 NAMES = ("u", "x", "y")
 UFUNCS = {

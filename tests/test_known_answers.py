@@ -92,9 +92,7 @@ def test_causes():
     # Cells 0..5 of [0, 6], A = cell 5. Moves by u in {0, 1} except:
     # cell 0: always leaves; cell 1: always stays; cell 2: half to 1, half to 5;
     # cell 3, 4: x + u.
-    jump = (
-        "where(x < 1, -5, where(x < 2, x, where(x < 3, where(x < 2.5, 1.5, 5.5), x + u)))"
-    )
+    jump = "where(x < 1, -5, where(x < 2, x, where(x < 3, where(x < 2.5, 1.5, 5.5), x + u)))"
     data = steps(1.0)
     data["system"]["next"] = {"x": jump}
     data["state_box"] = {"x": {"low": 0, "high": 6, "cells": 6}}

@@ -132,13 +132,19 @@ def brute_stabilizable(pairs, cells):
 @pytest.mark.parametrize("seed", range(150))
 def test_stabilizable_set_by_definition(seed):
     from models import build
+
     from lmdsl.rows import Rows
 
     rng = np.random.default_rng(seed)
     cells = int(rng.integers(1, 9))
     pairs = {
         i: [
-            sorted({int(j) for j in rng.integers(0, cells + (rng.random() < 0.4), size=rng.integers(1, 4))})
+            sorted(
+                {
+                    int(j)
+                    for j in rng.integers(0, cells + (rng.random() < 0.4), size=rng.integers(1, 4))
+                }
+            )
             for _ in range(rng.integers(0, 4))
         ]
         for i in range(cells)

@@ -319,9 +319,7 @@ def test_function_system_equals_formulas():
 
     problem = made(data)
     own = problem.replaced(system=FunctionSystem(next=kick, parameters={"K": 0.25}))
-    np.testing.assert_array_equal(
-        lm.solve(own).control_index, lm.solve(problem).control_index
-    )
+    np.testing.assert_array_equal(lm.solve(own).control_index, lm.solve(problem).control_index)
     with pytest.raises(lm.BadInput, match="FunctionSystem"):
         own.to_dict()
 

@@ -2,7 +2,10 @@
 
 Primal form: min c'x s.t. A x = b, x >= 0; its multiplier z of A x = b has the sign V = -z.
 Dual form: max b'V s.t. A'V <= c; its multiplier is theta.
-DEFAULT_SENTENCE
+
+The default is the primal form with faer. Standard map, gamma 1.02, two shared cores, times
+relative to it: dual 0.9 to 1.1 and QDLDL 0.8 (either form) at 50 x 50 cells; dual 1.4, primal with
+QDLDL more than 3 (not finished) at 100 x 100. V is good to 1e-7 (dual form: 1e-9).
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """CVXPY: the primal LP in matrices, for any solver that CVXPY finds installed.
 
-``cvxpy:NAME`` names the solver, in any case. DEFAULT_SENTENCE
+``cvxpy:NAME`` names the solver, in any case. The default is HiGHS. Standard map, gamma 1.02,
+50 x 50 cells, two shared cores, times relative to it: SciPy 1.8, SCS 3.5, Clarabel 6 to 7.
 HiGHS and SciPy are told to use the interior point, not the simplex that they choose unasked.
 
 CVXPY's multiplier y of A x = b has the sign of c'x + y'(A x - b): V = -y. It has no word for which
@@ -142,9 +143,7 @@ def _passed(
     return ({NESTED[solver]: passed} if solver in NESTED else passed), unsupported
 
 
-def _stop(
-    status: str, solver: str, iterations: int | None, most: int | None, late: bool
-) -> Stop:
+def _stop(status: str, solver: str, iterations: int | None, most: int | None, late: bool) -> Stop:
     """Map a status; what is not exact at a limit is the limit."""
     stop = STOPS.get(status, Stop.FAILED)
     exhausted = most is not None and iterations is not None and iterations >= most

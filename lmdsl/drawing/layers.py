@@ -48,9 +48,14 @@ def blank(columns: float = 1, rows: float = 1) -> Any:
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
     except ImportError:
         raise MissingDependency('plots need matplotlib: pip install "lmdsl[plot]"') from None
-    figure = Figure(figsize=(4.4 * columns + 0.3, 3.9 * rows + 0.3), dpi=110, layout="constrained")
+    figure = Figure(
+        figsize=(4.4 * columns + 0.3, 3.9 * rows + 0.3),
+        dpi=110,
+        layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1),
+    )
     FigureCanvasAgg(figure)
     return figure
 
@@ -102,12 +107,10 @@ def region(
         transform=place,
     )
     ax.add_patch(patch)
-    if above and not flat:
-        _ring(ax, view, mask)
     return patch
 
 
-def _ring(ax: Any, view: View, mask: Bools) -> None:
+def outline(ax: Any, view: View, mask: Bools, colour: str) -> None:
     """Outline the attractor, and ring its parts that are too small to see."""
     from matplotlib.collections import LineCollection
     from scipy.ndimage import find_objects, label
@@ -119,11 +122,11 @@ def _ring(ax: Any, view: View, mask: Bools) -> None:
     i, j = np.nonzero(padded[1:-1, 1:] != padded[1:-1, :-1])
     level = np.stack([np.stack([x[i], y[j]], -1), np.stack([x[i + 1], y[j]], -1)], 1)
     lines: Any = np.concatenate([upright, level])
-    ax.add_collection(LineCollection(lines, colors="white", linewidths=0.8, zorder=3.1))
+    ax.add_collection(LineCollection(lines, colors=colour, linewidths=0.9, zorder=3.1))
     for part in find_objects(label(mask)[0])[:100]:
         if all((q.stop - q.start) < 0.03 * n for q, n in zip(part, mask.shape, strict=True)):
             centre = [(e[q.start] + e[q.stop]) / 2 for e, q in zip((x, y), part, strict=True)]
-            for colour, width in (("white", 2.4), (ATTRACTOR, 1.3)):
+            for ink, width in (("white", 2.4), (ATTRACTOR, 1.3)):
                 ax.scatter(
                     *centre,
                     s=75,
@@ -143,6 +146,8 @@ def regions(
         for k in REGIONS
         if (code == k).any()
     ]
+    if len(view.axes) == 2:
+        outline(ax, view, code == CellStatus.ATTRACTOR, "white")
     if not legend or not handles:
         return
     from matplotlib.transforms import ScaledTranslation

@@ -113,7 +113,8 @@ class View:
     def shadow(self, mask: Bools) -> Bools:
         """Return where any cell over the axes not shown is marked."""
         grid = mask.reshape(self.partition.shape).transpose(self.axes + self.hidden)
-        return grid.any(axis=tuple(range(len(self.axes), grid.ndim)))
+        covered: Bools = np.asarray(grid.any(axis=tuple(range(len(self.axes), grid.ndim))))
+        return covered
 
 
 def rectangles(mask: Bools, x: Floats, y: Floats) -> Floats:

@@ -1,0 +1,266 @@
+"""The parts of a problem: axes, controls, noise, samplings, sets of cells; each a small model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+
+from lmdsl.declared import (
+    Box,
+    Count,
+    Declared,
+    FrozenDict,
+    Number,
+    Numbers,
+    Seed,
+    frozen_dict,
+    plain,
+    valid_names,
+)
+from lmdsl.errors import BadInput
+from lmdsl.systems import NAMED, FunctionSystem, MapSystem, OdeSystem, System
+
+MAX_AXES = 16
+MAX_HERMITE = 64
+
+Positive = Annotated[Number, Field(gt=0)]
+
+
+class Axis(Declared):
+    """One axis of the state box.
+
+    Attributes
+    ----------
+    low, high
+        Ends of the axis, low < high, in the units of the state.
+    cells
+        Number of equal cells.
+    periodic
+        True on a circle: images are wrapped into [low, high).
+    """
+
+    low: Number
+    high: Number
+    cells: Count
+    periodic: bool = False
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Axis:
+        width = (self.high - self.low) / self.cells
+        if not self.low < self.high:
+            raise BadInput(f"low {self.low!r} must be less than high {self.high!r}")
+        if not math.isfinite(width):
+            raise BadInput(f"high - low overflows: {self.low!r}, {self.high!r}; rescale the state")
+        scale = max(abs(self.low), abs(self.high))
+        if self.cells < 2**40 and not width > 1e-13 * scale:
+            raise BadInput(f"cells of width {width!r} are below what doubles resolve; use fewer")
+        return self
+
+
+class ControlRange(Declared):
+    """Equally spaced control values: ``numpy.linspace(low, high, points)``."""
+
+    low: Number
+    high: Number
+    points: Count
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ControlRange:
+        if self.points == 1 and self.low != self.high:
+            raise BadInput(f"one point needs low == high, not {self.low!r} and {self.high!r}")
+        if self.points > 1 and not self.low < self.high:
+            raise BadInput(f"low {self.low!r} must be less than high {self.high!r}")
+        if not math.isfinite(self.high - self.low):
+            raise BadInput(f"high - low overflows: {self.low!r}, {self.high!r}")
+        return self
+
+
+class ControlValues(Declared):
+    """Control values written out; distinct, order kept."""
+
+    values: Annotated[Numbers, Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _distinct(self) -> ControlValues:
+        seen: set[float] = set()
+        for value in self.values:
+            if value in seen:
+                raise BadInput(f"{value!r} stands twice; list each value once", "values")
+            seen.add(value)
+        return self
+
+
+class NoiseValues(Declared):
+    """A discrete noise variable: values and their probabilities."""
+
+    values: Annotated[Numbers, Field(min_length=1)]
+    weights: Annotated[Numbers, Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _distribution(self) -> NoiseValues:
+        if len(self.values) != len(self.weights):
+            raise BadInput(
+                f"{len(self.weights)} weights for {len(self.values)} values; give one each",
+                "weights",
+            )
+        for i, weight in enumerate(self.weights):
+            if weight < 0:
+                raise BadInput(
+                    f"{weight!r} is negative; weights are probabilities", f"weights[{i}]"
+                )
+        total = math.fsum(self.weights)
+        if abs(total - 1) > 1e-9:
+            raise BadInput(f"the weights sum to {total!r}; they must sum to 1", "weights")
+        return self
+
+
+class Normal(Declared):
+    """A normal distribution of mean 0 by Gauss-Hermite quadrature."""
+
+    std: Positive
+    points: Annotated[Count, Field(le=MAX_HERMITE)]
+
+
+class NoiseNormal(Declared):
+    """A normally distributed noise variable."""
+
+    normal: Normal
+
+
+class Grid(Declared):
+    """Sample points (i + 1/2)/k on each axis of a cell, C order."""
+
+    kind: Literal["grid"] = "grid"
+    per_axis: Count
+
+
+class Random(Declared):
+    """Uniform sample points, the same in every cell: ``default_rng(seed).random((points, d))``."""
+
+    kind: Literal["random"] = "random"
+    points: Count
+    seed: Seed = 0
+
+
+class Sobol(Declared):
+    """Scrambled Sobol points, the same in every cell."""
+
+    kind: Literal["sobol"] = "sobol"
+    points: Count
+    seed: Seed = 0
+
+
+def _tag_by_kind(value: Any) -> str:
+    kind = value.get("kind") if isinstance(value, Mapping) else getattr(value, "kind", None)
+    return f"<{kind}>" if isinstance(kind, str) else "<?>"
+
+
+def _tag_by_key(key: str, model: type) -> Any:
+    def tag(value: Any) -> str:
+        held = isinstance(value, model) or (isinstance(value, Mapping) and key in value)
+        return "<a>" if held else "<b>"
+
+    return Discriminator(tag)
+
+
+def _kinds(*models: type[Declared]) -> Any:
+    tagged = [Annotated[m, Tag(f"<{m.model_fields['kind'].default}>")] for m in models]
+    union: Any = tagged[0]
+    for member in tagged[1:]:
+        union = union | member
+    names = ", ".join(str(m.model_fields["kind"].default) for m in models)
+    return Annotated[
+        union,
+        Discriminator(
+            _tag_by_kind,
+            custom_error_type="kind",
+            custom_error_message=f"'kind' is missing or unknown; known kinds: {names}",
+        ),
+    ]
+
+
+def _json_kinds(value: Any) -> Any:
+    if isinstance(value, Mapping) and value.get("kind") == "function":
+        raise BadInput(
+            "kind 'function' cannot be declared as data; build a FunctionSystem in Python, "
+            "or write formulas with kind 'map' or 'ode'"
+        )
+    return value
+
+
+if TYPE_CHECKING:
+    SystemUnion = System
+    SamplingUnion = Grid | Random | Sobol
+else:
+    SystemUnion = Annotated[
+        _kinds(MapSystem, OdeSystem, *NAMED.values(), FunctionSystem), BeforeValidator(_json_kinds)
+    ]
+    SamplingUnion = _kinds(Grid, Random, Sobol)
+ControlUnion = Annotated[
+    Annotated[ControlValues, Tag("<a>")] | Annotated[ControlRange, Tag("<b>")],
+    _tag_by_key("values", ControlValues),
+]
+NoiseUnion = Annotated[
+    Annotated[NoiseNormal, Tag("<a>")] | Annotated[NoiseValues, Tag("<b>")],
+    _tag_by_key("normal", NoiseNormal),
+]
+
+Point = Annotated[
+    tuple[Number, ...] | dict[str, Number],
+    BeforeValidator(plain),
+    AfterValidator(lambda v: FrozenDict(v) if isinstance(v, dict) else v),
+]
+Points = Annotated[tuple[Point, ...], BeforeValidator(plain)]
+Boxes = Annotated[tuple[Box, ...], BeforeValidator(plain)]
+CellIndex = Annotated[tuple[Annotated[int, Field(strict=True, ge=0)], ...], BeforeValidator(plain)]
+CellIndices = Annotated[tuple[CellIndex, ...], BeforeValidator(plain)]
+
+
+class Attractor(Declared):
+    """The attractor cells: the union of points, boxes and cells.
+
+    Attributes
+    ----------
+    points
+        Every closed cell within 1e-9 widths of a point; a list or an object per point.
+    boxes
+        The cells inside a box (up to 1e-9 widths).
+    cells
+        Multi-indices of cells.
+    """
+
+    points: Points = ()
+    boxes: Boxes = ()
+    cells: CellIndices = ()
+
+    @model_validator(mode="after")
+    def _something(self) -> Attractor:
+        if not (self.points or self.boxes or self.cells):
+            raise BadInput("no attractor cell; give points, boxes or cells")
+        return self
+
+
+class Avoid(Declared):
+    """Unsafe cells: every cell whose interior overlaps a box. Landing there counts as leaving."""
+
+    boxes: Annotated[Boxes, Field(min_length=1)]
+
+
+class Measure(Declared):
+    """Support of the weight m: the cells inside the union of boxes, intersected with C."""
+
+    boxes: Annotated[Boxes, Field(min_length=1)]
+
+
+StateBox = Annotated[
+    dict[str, Axis],
+    BeforeValidator(plain),
+    Field(min_length=1, max_length=MAX_AXES),
+    valid_names,
+    frozen_dict,
+]
+ControlGrid = Annotated[dict[str, ControlUnion], BeforeValidator(plain), valid_names, frozen_dict]
+Noise = Annotated[dict[str, NoiseUnion], BeforeValidator(plain), valid_names, frozen_dict]

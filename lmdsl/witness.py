@@ -1,0 +1,145 @@
+"""Making the vectors behind a certificate: good guesses, repaired until the checks accept them.
+
+Nothing here is trusted: certificate.check judges what comes out.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl import bounds, linear, policy
+from lmdsl.bellman import padded
+from lmdsl.certificate import Verified, Witness, check, check_lower, check_upper, gap, weighted
+from lmdsl.lp import StabilizationLP
+
+Floats = NDArray[np.float64]
+Pairs = NDArray[np.int64]
+
+
+RELATIVE_SLACK = (1e-13, 1e-11, 1e-9)
+"""Near gamma_bar an absolute slack drowns in the rounding of large values. The value at
+gamma (1 + s) leaves a slack s gamma P V relative to V above; the optimum at gamma (1 - s) below."""
+
+
+def certify(
+    lp: StabilizationLP,
+    pair: Pairs,
+    tolerance: float,
+    value: Floats | None = None,
+    w: Floats | None = None,
+) -> Verified:
+    """Make the vectors of claims 1 to 4 for a policy and check them.
+
+    Parameters
+    ----------
+    lp, pair
+        The finite model and one column per cell.
+    tolerance
+        Largest gap that counts as verified.
+    value, w
+        Guesses of the policy's value and its unit-cost value; made where missing.
+    """
+    w, d = policy.stability_vector(lp, pair, w)
+    V = policy.evaluate(lp, pair, start=value)
+    if V is None:
+        witness = Witness(pair, w, None, lower_vector(lp, None, tolerance), None)
+        return Verified(check(lp, witness, tolerance), witness)
+    V_up, W = upper_vector(lp, pair, V, w, d), lower_vector(lp, V, tolerance)
+    best = gap(lp, V_up, W)
+    for slack in RELATIVE_SLACK:
+        if best <= tolerance:
+            break
+        V_up = _lesser(lp, V_up, _upper_with_slack(lp, pair, slack))
+        W = _greater(lp, W, _lower_with_slack(lp, pair, V, slack))
+        best = gap(lp, V_up, W)
+    witness = Witness(pair, w, V_up, W, _measure_vector(lp, pair))
+    return Verified(check(lp, witness, tolerance), witness)
+
+
+def _upper_with_slack(lp: StabilizationLP, pair: Pairs, slack: float) -> Floats | None:
+    V = policy.evaluate(lp, pair, lp.gamma * (1 + slack))
+    return V if V is not None and check_upper(lp, pair, V) else None
+
+
+def _lower_with_slack(lp: StabilizationLP, pair: Pairs, V: Floats, slack: float) -> Floats | None:
+    gamma = lp.gamma * (1 - slack)
+    value = policy.evaluate(lp, pair, gamma, start=V)
+    if value is None:
+        return None
+    W = policy.iterate(lp, pair, value, gamma, limit=20).value
+    return W if check_lower(lp, W) else None
+
+
+def _lesser(lp: StabilizationLP, a: Floats | None, b: Floats | None) -> Floats | None:
+    known = [x for x in (a, b) if x is not None]
+    return min(known, key=lambda x: weighted(lp, x), default=None)
+
+
+def _greater(lp: StabilizationLP, a: Floats, b: Floats | None) -> Floats:
+    return a if b is None or weighted(lp, a) >= weighted(lp, b) else b
+
+
+def upper_vector(
+    lp: StabilizationLP, pair: Pairs, V: Floats, w: Floats | None, d: Floats | None
+) -> Floats | None:
+    """Return V_up = V + delta w with delta >= max(residual / d), None where it fails."""
+    if check_upper(lp, pair, V):
+        return V
+    if w is None or d is None:
+        if lp.gamma >= 1:
+            return None
+        w, d = np.ones(lp.n), np.full(lp.n, (1 - lp.gamma) * 0.99)
+    for _ in range(4):
+        future = bounds.expected_above(lp, pair, V, lp.gamma)
+        residual = bounds.add_above(future, lp.cost[pair]) - V
+        delta = max(float((residual / d).max()), 0.0) * 1.01
+        V = V + delta * w
+        if not np.isfinite(V).all():
+            return None
+        if check_upper(lp, pair, V):
+            return V
+    return None
+
+
+def lower_vector(lp: StabilizationLP, V: Floats | None, tolerance: float) -> Floats:
+    """Return W of claim 3, as large as can be proved from V; 0 always serves."""
+    zero = np.zeros(lp.n)
+    candidates: list[Floats] = []
+    if V is not None:
+        W = _scaled(lp, V)
+        if W is not None:
+            return W
+        start = V * (1 - min(tolerance, 1e-6) / 4)
+        W = bounds.lower_until_below(lp, start, lp.gamma, lp.cost)
+        if W is not None:
+            candidates.append(W)
+    if V is None or not candidates or gap(lp, V, candidates[0]) > tolerance:
+        candidates.append(bounds.raise_from_zero(lp, lp.gamma, lp.cost, 2000))
+    good = [W for W in candidates if check_lower(lp, W)]
+    best: Floats = max(good, key=lambda W: weighted(lp, W), default=zero)
+    return best
+
+
+def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
+    """W = (1 - eps) V: it serves once r_a <= eps/(1 - eps) G_a for every surviving pair."""
+    rows = lp.rows
+    worst, stuck = bounds.worst_excess(
+        lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+        lp.gamma, lp.cost, padded(V),
+    )  # fmt: skip
+    if stuck or not worst < 1:
+        return None
+    for margin in (1.0, 2.0, 16.0):
+        eps = margin * worst / (1 + worst) + (margin - 1) * 1e-15
+        W: Floats = V * (1 - eps)
+        if check_lower(lp, W):
+            return W
+    return None
+
+
+def _measure_vector(lp: StabilizationLP, pair: Pairs) -> Floats | None:
+    inflow: Any = lp.gamma * lp.rows.matrix(pair).T.tocsr()
+    return linear.solve(inflow, lp.weight)
