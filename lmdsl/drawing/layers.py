@@ -131,7 +131,7 @@ def outline(ax: Any, view: View, mask: Bools, colour: str) -> None:
                     *centre,
                     s=75,
                     facecolors="none",
-                    edgecolors=colour,
+                    edgecolors=ink,
                     linewidths=width,
                     zorder=3.2,
                 )
