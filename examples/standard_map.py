@@ -21,9 +21,7 @@ print("the closed loop contracts by", round(result.contraction, 4), "per step")
 
 print("control at (0.1, 0.2):", result.controller([0.1, 0.2]))
 run = result.simulate(starts=2000, steps=5000)
-print(
-    f"true map: {run.reached} of {run.starts} runs reach the orbit, half in {run.steps['q50']} steps"
-)
+print(f"true map: {run.reached} of {run.starts} runs arrive, half in {run.steps['q50']} steps")
 
 if len(sys.argv) > 1:
     import matplotlib as mpl

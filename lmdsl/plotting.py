@@ -21,14 +21,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lmdsl.drawing import layers, runs
-from lmdsl.drawing.view import At, Floats, View, plain
+from lmdsl.drawing.view import At, Floats, View, number, plain
 from lmdsl.errors import BadInput, shown
 from lmdsl.files import write_whole
 from lmdsl.graph import CellStatus
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.sampling import control_values
 from lmdsl.regions import Regions
+from lmdsl.sampling import control_values
 
 if TYPE_CHECKING:
     import os
@@ -84,7 +84,7 @@ def portrait(
     view = View.of(partition, attractor, axes, at)
     u = runs.control_vector(given, control)
     lines = runs.is_ode(given)
-    held = ", ".join(f"{plain(k, 16)} = {v:.3g}" for k, v in u.items())
+    held = ", ".join(f"{plain(k, 16)} = {number(v)}" for k, v in u.items())
     title = ("flow" if lines else "map") + (f" at {held}" if held else "") + view.note
     drawn: Axes = layers.frame(ax, view, title)
     layers.region(drawn, view, view.shadow(attractor), CellStatus.ATTRACTOR)
@@ -140,7 +140,8 @@ def cost(
     """
     view = _view(result, axes, at)
     solved = result.status != "not_stabilizable"
-    word = "optimal cost" if result.verified else "cost, not verified" if solved else "causes"
+    optimal = "optimal cost" if result.problem.controls else "cost"
+    word = optimal if result.verified else "cost, not verified" if solved else "causes"
     drawn: Axes = layers.frame(ax, view, word + view.note)
     value = view.slice(_on_stabilized(result, result.value))
     if np.isfinite(value).any():
@@ -295,6 +296,7 @@ def trajectories(
     drawn.set_title(f"closed loop, {int(reached.sum())} of {len(x)} runs reach A", fontsize=11)
     if len(view.axes) == 1:
         drawn.set_xlabel("step")
+        drawn.locator_params(axis="x", integer=True)
         drawn.set_ylabel(view.label(0))
         drawn.set_xlim(-0.4, (len(points) - 1) / pieces + 0.4)
         drawn.set_ylim(*view.ends(0))
@@ -349,11 +351,15 @@ def figure(
         draw.append(lambda ax: measure(result, ax, axes=axes, at=at))
         draw.append(lambda ax: trajectories(result, ax, seed=seed, axes=axes, at=at))
     draw.append(lambda ax: _numbers(ax, result))
-    columns = min(len(draw), 4 if len(draw) in (7, 8) else 3)
+    columns = min(len(draw), 3)
     rows = -(-len(draw) // columns)
     page: Figure = layers.blank(columns, rows)
     for k, panel in enumerate(draw):
-        panel(page.add_subplot(rows, columns, k + 1))
+        ax = page.add_subplot(rows, columns, k + 1)
+        try:
+            panel(ax)
+        except BadInput as error:  # such as a Python function that a directory does not hold
+            layers.remark(ax, textwrap.fill(plain(error.message, 200), 36))
     page.suptitle(plain(result.problem.name, 100), fontsize=13)
     if target is not None:
         content = BytesIO()
@@ -388,27 +394,27 @@ def _codes(result: Result) -> NDArray[np.uint8]:
 def _numbers(ax: Any, result: Result) -> None:
     """Write the status and the key numbers."""
 
-    def number(value: float | None) -> str:
-        return "unknown" if value is None else f"{value:.6g}"
+    def known(value: float | None, digits: int = 6) -> str:
+        return "unknown" if value is None else number(value, digits)
 
     cells = f"{result.stabilizable_cells} of {result.cells} stabilizable"
     rows = [
         ("status", result.status.replace("_", " ")),
         ("backend", plain(result.backend or "none", 30)),
-        ("gamma", number(result.gamma)),
-        ("cost", number(result.cost)),
-        ("lower bound", number(result.lower_bound)),
-        ("gap", "unknown" if result.gap is None else f"{result.gap:.1e}"),
-        ("contraction", number(result.contraction)),
+        ("gamma", known(result.gamma)),
+        ("cost", known(result.cost)),
+        ("lower bound", known(result.lower_bound)),
+        ("gap", known(result.gap, 2)),
+        ("contraction", known(result.contraction)),
         ("cells", cells),
         ("attractor", f"{result.attractor_cells} cell{'s' if result.attractor_cells != 1 else ''}"),
-        ("controls", number(result.controls)),
+        ("controls", known(result.controls)),
     ]
     ax.set_axis_off()
     for k, (name, value) in enumerate(rows):
         y = 0.97 - 0.075 * k
         ax.text(0.02, y, name, transform=ax.transAxes, va="top", color="#666666")
-        ax.text(0.34, y, value, transform=ax.transAxes, va="top", color=layers.INK)
+        ax.text(0.38, y, value, transform=ax.transAxes, va="top", color=layers.INK)
     message = textwrap.fill(plain(result.message, 300), 46)
     y = 0.97 - 0.075 * (len(rows) + 0.5)
     ax.text(0.02, y, message, transform=ax.transAxes, va="top", fontsize=9, color=layers.INK)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from lmdsl import backends, bellman, certificate, policy
 from lmdsl.backends import Backend, Options, Solution, Stop
+from lmdsl.backends.scaled import failure
 from lmdsl.certificate import Certificate, Verified, Witness
 from lmdsl.errors import BadInput
 from lmdsl.graph import CellStatus
@@ -108,8 +109,8 @@ def solve(
     else:
         if progress:
             progress("solve", -1.0)
-        solution = chosen.solve(lp, options)
-    outcome = _polish(lp, solution, first.pair, tolerance)
+        solution = _asked(lp, chosen, options)
+    outcome = _polish(lp, solution, first.pair, tolerance, late)
     job.solve_seconds = time.perf_counter() - started
     if progress:
         progress("verify", -1.0)
@@ -159,6 +160,42 @@ class _Outcome:
     gap_before: float | None
 
 
+def _asked(lp: StabilizationLP, backend: Backend, options: Options) -> Solution:
+    """Ask a backend; whatever it raises or returns, a well-formed solution comes out."""
+    try:
+        solution = backend.solve(lp, options)
+    except BadInput:
+        raise
+    except BaseException as error:  # solvers written in Rust panic outside Exception
+        return failure(error)
+    if not isinstance(solution, Solution) or not isinstance(solution.stop, Stop):
+        return Solution(Stop.FAILED, "the backend returned no Solution")
+    return replace(
+        solution,
+        word=str(solution.word)[:200],
+        value=_vector(solution.value, lp.n),
+        occupation=_vector(solution.occupation, lp.K),
+        pair=_policy(lp, solution.pair),
+    )
+
+
+def _vector(values: Any, count: int) -> Any:
+    """Return values as finite doubles of the right length, else None."""
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return array if array.shape == (count,) and np.isfinite(array).all() else None
+
+
+def _policy(lp: StabilizationLP, pair: Any) -> Pairs | None:
+    """Return a policy as an array of columns, one of each cell's own, else None."""
+    if not isinstance(pair, np.ndarray) or pair.shape != (lp.n,) or pair.dtype.kind not in "iu":
+        return None
+    own = (pair >= lp.pair_pointer[:-1]) & (pair < lp.pair_pointer[1:])
+    return pair.astype(np.int64) if own.all() else None
+
+
 def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
     """Return the policy of a solution: its own, else greedy in V, else largest occupation."""
     if solution.pair is not None:
@@ -172,30 +209,38 @@ def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
     return None
 
 
-def _polish(lp: StabilizationLP, solution: Solution, start: Pairs, tolerance: float) -> _Outcome:
+def _polish(
+    lp: StabilizationLP, solution: Solution, start: Pairs, tolerance: float, stop: policy.Stop
+) -> _Outcome:
     """Improve a backend's policy exactly until nothing is strictly better, then break ties.
 
     A policy that is not g-stabilizing is discarded where gamma >= 1. After a limit the policy is
     left as it is: a limit is not a license to go on.
     """
     pair = _claimed(lp, solution)
-    value = None if pair is None else policy.evaluate(lp, pair, start=solution.value)
-    gap_before = None
-    if value is None or pair is None:
-        pair, value = start, policy.evaluate(lp, start)
+    if pair is not None and not _usable(lp, pair):
+        pair = None
+    if pair is None:
+        pair = start
+    value = policy.evaluate(lp, pair, start=None if solution.pair is None else solution.value)
     if value is None or solution.stop.limit:
         return _Outcome(pair, value, 0, None)
-    done = policy.iterate(lp, pair, value)
+    done = policy.iterate(lp, pair, value, stop=stop)
+    gap_before = None
     if done.steps:
         gap_before = certify(lp, pair, tolerance, value).certificate.gap
     tidy = policy.canonical(lp, done.pair, done.value)
-    if (tidy == done.pair).all():
-        return _Outcome(done.pair, done.value, done.steps, gap_before)
-    tidy_value = policy.evaluate(lp, tidy, start=done.value)
-    limit = (1 + tolerance / 4) * certificate.weighted(lp, done.value)
-    if tidy_value is None or certificate.weighted(lp, tidy_value) > limit:
-        return _Outcome(done.pair, done.value, done.steps, gap_before)
-    return _Outcome(tidy, tidy_value, done.steps, gap_before)
+    if (tidy != done.pair).any() and _usable(lp, tidy):
+        tidy_value = policy.evaluate(lp, tidy, start=done.value)
+        limit = (1 + tolerance / 4) * certificate.weighted(lp, done.value)
+        # Where breaking ties costs more than the tolerance, the strict minimisers stay.
+        if tidy_value is not None and certificate.weighted(lp, tidy_value) <= limit:
+            return _Outcome(tidy, tidy_value, done.steps, gap_before)
+    return _Outcome(done.pair, done.value, done.steps, gap_before)
+
+
+def _usable(lp: StabilizationLP, pair: Pairs) -> bool:
+    return lp.gamma < 1 or policy.stability_vector(lp, pair)[0] is not None
 
 
 class _Job:

@@ -176,9 +176,9 @@ def double_integrator(s, u):
     return [s[1], u]
 
 
-def inverted_pendulum(s, u):
+def inverted_pendulum(s, u, m=1.0, length=1.0, g=9.81, d=0.1):
     # Moment of inertia times angular acceleration = gravity's moment + motor - friction.
-    return [s[1], (1.0 * 9.81 * 1.0 * np.sin(s[0]) + u - 0.1 * s[1]) / (1.0 * 1.0**2)]
+    return [s[1], (m * g * length * np.sin(s[0]) + u - d * s[1]) / (m * length**2)]
 
 
 def pendulum_on_cart(s, u):
@@ -204,26 +204,44 @@ def lorenz(s, u):
     return [10 * y - 10 * x, 28 * x + u * x - x * z - y, x * y - 8 * z / 3]
 
 
-@pytest.mark.parametrize(
-    "by_hand", [double_integrator, inverted_pendulum, pendulum_on_cart, van_der_pol, lorenz]
-)
+def integrate(field, x, u, duration):
+    """The flow of every column of x, with its control held."""
+    exact = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-10}
+    flows = [
+        solve_ivp(lambda t, s, u=u[i]: field(s, u), (0, duration), x[:, i], **exact).y[:, -1]
+        for i in range(x.shape[1])
+    ]
+    return np.array(flows).T
+
+
+@pytest.mark.parametrize("by_hand", [inverted_pendulum, pendulum_on_cart, van_der_pol, lorenz])
 def test_sampled_flow_agrees_with_an_integrator(by_hand):
     """The right-hand side is right, and RK4's error is small against a cell."""
     problem = variant(by_hand.__name__)
     x, u = draw(by_hand.__name__, 60, np.random.default_rng(4))
     image = images(problem, x, u)
-    system = problem.system
-    duration = system.step if hasattr(system, "step") else system.constants()["h"]
-    exact = {"method": "DOP853", "rtol": 1e-10, "atol": 1e-10}
-    true = np.empty_like(x)
-    for i in range(x.shape[1]):
-        flow = solve_ivp(lambda t, s, u=u[i]: by_hand(s, u), (0, duration), x[:, i], **exact)
-        true[:, i] = flow.y[:, -1]
+    true = integrate(by_hand, x, u, problem.system.step)
     width = np.array([(a.high - a.low) / a.cells for a in problem.state_box.values()])
     error = np.abs(image - true) / width[:, None]
     assert error.max() < 0.02
     # A wrong coefficient shows in the bulk of the points, far above the integrator's error.
     assert np.median(error) < 1e-3
+
+
+def test_double_integrator_is_sampled_exactly():
+    x, u = draw("double_integrator", 60, np.random.default_rng(5))
+    image = images(variant("double_integrator"), x, u)
+    np.testing.assert_allclose(image, integrate(double_integrator, x, u, 0.15), atol=1e-9)
+
+
+def test_pendulum_of_other_size():
+    """Mass and length of 1 would hide a wrong power of them."""
+    other = {"m": 2.0, "l": 0.5, "g": 9.81, "d": 0.3}
+    system = {"kind": "inverted_pendulum", "parameters": other, "step": 0.1, "substeps": 20}
+    x, u = draw("inverted_pendulum", 30, np.random.default_rng(6))
+    image = images(variant("inverted_pendulum", system=system), x, u)
+    true = integrate(lambda s, u: inverted_pendulum(s, u, *other.values()), x, u, 0.1)
+    np.testing.assert_allclose(image, true, atol=1e-6)
 
 
 # ------------------------------------------------------------------------------ standard map

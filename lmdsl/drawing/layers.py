@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.drawing.view import Bools, Floats, View, rectangles, segments
+from lmdsl.drawing.view import Bools, Floats, View, number, rectangles, segments
 from lmdsl.errors import MissingDependency
 from lmdsl.graph import CellStatus
 
@@ -73,9 +73,7 @@ def frame(ax: Any, view: View, title: str) -> Any:
     return ax
 
 
-def region(
-    ax: Any, view: View, mask: Bools, code: int, above: bool = False, upright: bool = True
-) -> Any:
+def region(ax: Any, view: View, mask: Bools, code: int, upright: bool = True) -> Any:
     """Fill the cells of a mask (in the view's shape) as a region; return its legend handle.
 
     One axis makes bands across the other direction, vertical ones if ``upright``.
@@ -102,7 +100,7 @@ def region(
         hatch=None if many else hatch,
         linewidth=0,
         label=name,
-        zorder=3 if above else 0.5,
+        zorder=0.5,
         rasterized=many,
         transform=place,
     )
@@ -141,11 +139,7 @@ def regions(
     ax: Any, view: View, code: NDArray[np.integer], legend: bool, upright: bool = True
 ) -> None:
     """Fill every region of a slice: the attractor, and by cause what is not stabilized."""
-    handles = [
-        region(ax, view, code == k, k, above=k == CellStatus.ATTRACTOR, upright=upright)
-        for k in REGIONS
-        if (code == k).any()
-    ]
+    handles = [region(ax, view, code == k, k, upright) for k in REGIONS if (code == k).any()]
     if len(view.axes) == 2:
         outline(ax, view, code == CellStatus.ATTRACTOR, "white")
     if not legend or not handles:
@@ -221,10 +215,11 @@ def levels(ax: Any, view: View, values: Floats, grid: Floats, label: str) -> Non
     edges = np.concatenate([[level[0] - half[0]], level[1:] - gaps / 2, [level[-1] + half[-1]]])
     picture = image(ax, view, values, ListedColormap(colours))
     picture.set_norm(BoundaryNorm(edges, n))
-    ticks = level[_thinned(n, round(float(zero)))]
-    colour_bar = bar(ax, picture, label, ticks=ticks, spacing="uniform")
+    kept = _thinned(n, round(float(zero)))
+    middle = (edges[:-1] + edges[1:]) / 2
+    colour_bar = bar(ax, picture, label, ticks=middle[kept], spacing="uniform")
     colour_bar.ax.minorticks_off()
-    colour_bar.set_ticklabels([f"{v + 0.0:.3g}".replace("-", "\N{MINUS SIGN}") for v in ticks])
+    colour_bar.set_ticklabels([number(v) for v in level[kept]])
 
 
 def _thinned(n: int, zero: int, most: int = 11) -> NDArray[np.int64]:

@@ -27,6 +27,11 @@ def plain(text: str, limit: int = 60) -> str:
     return line.replace("$", r"\$")
 
 
+def number(value: float, digits: int = 3) -> str:
+    """Return a number as text, with a true minus sign."""
+    return f"{value + 0.0:.{digits}g}".replace("-", "\N{MINUS SIGN}")
+
+
 @dataclass(frozen=True)
 class View:
     """One or two axes of the partition, the others held at one cell.
@@ -87,7 +92,7 @@ class View:
         """Where the slice is, such as " (z ≈ 25.5)"; empty when every axis is shown."""
         p = self.partition
         at = p.low + (self.cell + 0.5) * p.width
-        held = [f"{plain(p.names[k], 16)} ≈ {at[k]:.3g}" for k in self.hidden]
+        held = [f"{plain(p.names[k], 16)} ≈ {number(at[k])}" for k in self.hidden]
         return f" ({', '.join(held[:4])}{', …' if len(held) > 4 else ''})" if held else ""
 
     def label(self, k: int) -> str:
