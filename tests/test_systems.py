@@ -515,7 +515,8 @@ def test_lorenz_symmetry():
 def test_lorenz_control_beats_waiting():
     """A free orbit visits C+ too, after hundreds of steps; adjusting the heating takes a dozen."""
     controlled = solved("lorenz").simulate(1000, 500)
-    assert controlled.steps["q99"] < 50
+    assert controlled.reached > 0.99 * controlled.starts
+    assert controlled.steps["q99"] < 25
     left_alone = lm.solve(uncontrolled("lorenz")).simulate(1000, 200)
     assert left_alone.reached < 0.5 * left_alone.starts
 
