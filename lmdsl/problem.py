@@ -192,7 +192,10 @@ class Problem(Declared):
         """Return the problem as plain data that ``json.dumps`` accepts, defaults written out."""
         if isinstance(self.system, FunctionSystem):
             raise BadInput("a FunctionSystem cannot be written to a file; use formulas", "system")
-        return self.model_dump(mode="json", exclude_none=True)
+        data = self.model_dump(mode="json", exclude_none=True)
+        for key in ("system", "sampling"):
+            data[key] = {"kind": data[key]["kind"], **data[key]}  # kind first, for people
+        return data
 
     def to_json(self) -> str:
         """Return the problem file as text."""

@@ -139,7 +139,8 @@ def estimate(problem: Problem, entries: float = 1.0) -> int:
     rows = pairs * (20 + entries * (4 + code) * 1.25)
     graph = pairs * (8 + 4 * entries)
     grids = M * 8 * (1 + len(problem.control_grid)) + S * (8 * len(problem.state_box) + 200)
-    temporaries = 12 * 8 * max(CHUNK, S)
+    # Samples and images of every axis, and the intermediate arrays of a formula.
+    temporaries = (2 * len(problem.state_box) + 10) * 8 * max(CHUNK, S)
     return int(min(N * 40 + rows + graph + grids + temporaries, 1e30))
 
 

@@ -336,6 +336,20 @@ def test_function_system_that_returns_nonsense():
             lm.solve(problem.replaced(system=FunctionSystem(next=function)))
 
 
+def test_named_systems_name_what_they_need():
+    henon = dict(lm.systems.NAMED["henon_map"].problem)
+    with pytest.raises(lm.BadInput, match=r"control_grid: henon_map has the control u"):
+        made({**henon, "control_grid": {}})
+    box = {"x": henon["state_box"]["x"]}
+    with pytest.raises(lm.BadInput, match=r"state_box: henon_map has the states x, y"):
+        made({**henon, "state_box": box, "attractor": {"points": [[0.6]]}})
+
+
+def test_kind_comes_first_in_a_saved_file():
+    saved = made(standard_map()).to_dict()
+    assert all(next(iter(saved[key])) == "kind" for key in ("system", "sampling"))
+
+
 def test_schema_describes_the_file():
     from jsonschema import Draft202012Validator
 

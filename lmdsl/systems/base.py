@@ -8,6 +8,7 @@ simulation, plots) treats them alike. Every right-hand side sees the old values.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -17,7 +18,7 @@ from pydantic import Field, model_validator
 
 from lmdsl.declared import Count, Declared, Formulas, Number, Parameters
 from lmdsl.errors import BadInput, shown
-from lmdsl.formulas import parse
+from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, parse
 from lmdsl.program import Program
 
 Array = NDArray[np.float64]
@@ -175,23 +176,46 @@ class NamedSystem(System):
                 )
         return self
 
+    formulas: ClassVar[Mapping[str, str]] = {}
+
     def constants(self) -> Mapping[str, float]:
         """Return the values of all parameters, defaults included."""
         return {**self.defaults, **self.parameters}
+
+    @classmethod
+    def controls(cls) -> tuple[str, ...]:
+        """Return the names of the controls in the formulas, sorted."""
+        found = set(re.findall(r"[A-Za-z_]\w*", " ".join(cls.formulas.values())))
+        known = {*FORMULA_FUNCTIONS, *FORMULA_CONSTANTS, *cls.defaults, *cls.formulas}
+        return tuple(sorted(found - known))
+
+    def definition(self) -> MapSystem | OdeSystem:
+        """Return the same system with its formulas written out."""
+        raise NotImplementedError
+
+    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+        """See :meth:`System.compile`."""
+        if set(states) != set(self.formulas):
+            raise BadInput(
+                f"{self.kind} has the states {', '.join(self.formulas)}; declare these axes",
+                "state_box",
+            )
+        for control in self.controls():
+            if control not in controls and control not in noise:
+                raise BadInput(
+                    f"{self.kind} has the control {control}; declare it, for example "
+                    f'"{control}": {{"values": [0]}}',
+                    "control_grid",
+                )
+        return self.definition().compile(states, controls, noise)
 
 
 class NamedMap(NamedSystem):
     """A named discrete-time map; a subclass sets ``formulas``."""
 
-    formulas: ClassVar[Mapping[str, str]] = {}
-
     def definition(self) -> MapSystem:
-        """Return the same system with its formulas written out."""
+        """See :meth:`NamedSystem.definition`."""
         return MapSystem(parameters=dict(self.constants()), next=dict(self.formulas))
-
-    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
-        """See :meth:`System.compile`."""
-        return self.definition().compile(states, controls, noise)
 
 
 class NamedOde(NamedSystem):
@@ -205,22 +229,17 @@ class NamedOde(NamedSystem):
         RK4 steps per sampling time.
     """
 
-    formulas: ClassVar[Mapping[str, str]] = {}
     step: Duration = 0.1
     substeps: Substeps = 1
 
     def definition(self) -> OdeSystem:
-        """Return the same system with its formulas written out."""
+        """See :meth:`NamedSystem.definition`."""
         return OdeSystem(
             parameters=dict(self.constants()),
             derivative=dict(self.formulas),
             step=self.step,
             substeps=self.substeps,
         )
-
-    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
-        """See :meth:`System.compile`."""
-        return self.definition().compile(states, controls, noise)
 
 
 class FunctionSystem(System):
