@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,15 +135,40 @@ def check_lower(lp: StabilizationLP, W: Floats) -> bool:
 
 
 def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
-    """Claim 4: return ||m - mu + gamma P_u'mu||_1 rounded up; infinite where mu is not >= 0."""
+    """Claim 4: return ||m - mu + gamma P_u'mu||_1 rounded up; infinite where mu is not >= 0.
+
+    Where the rounding of a large measure alone exceeds the tolerance, small models are summed
+    exactly.
+    """
     if not (np.isfinite(mu).all() and (mu >= 0).all()):
         return math.inf
     P = lp.rows.matrix(pair).T.tocsr()
-    inflow = lp.gamma * (P @ mu)
-    entries = np.diff(P.indptr)
-    rounding = (entries + 8) * bounds.UNIT * (lp.weight + mu + inflow)
-    residual = np.abs((lp.weight - mu) + inflow) + rounding
-    return math.fsum(residual) * (1 + 4 * bounds.UNIT)
+    with np.errstate(over="ignore", invalid="ignore"):
+        inflow = lp.gamma * (P @ mu)
+        entries = np.diff(P.indptr)
+        rounding = (entries + 8) * bounds.UNIT * (lp.weight + mu + inflow) + bounds.TINY
+        residual = np.abs((lp.weight - mu) + inflow)
+    if not np.isfinite(residual).all():
+        return math.inf
+    bound = math.fsum(residual + rounding) * (1 + 4 * bounds.UNIT)
+    hopeful = bound - 2 * math.fsum(rounding) <= MEASURE_TOLERANCE < bound
+    if hopeful and len(P.data) <= bounds.MAX_EXACT:
+        return _exact_residual(lp, pair, mu)
+    return bound
+
+
+def _exact_residual(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
+    total, gamma = lp.rows.shares.total, Fraction(lp.gamma)
+    inflow = [Fraction(0)] * (lp.n + 1)
+    for i, k in enumerate(pair):
+        mass = Fraction(float(mu[i]))
+        for j, share in lp.rows.exact(int(k)):
+            inflow[j] += mass * share
+    residual = sum(
+        abs(Fraction(float(lp.weight[j])) - Fraction(float(mu[j])) + gamma * inflow[j] / total)
+        for j in range(lp.n)
+    )
+    return float(np.nextafter(float(residual), math.inf))
 
 
 def check_refusal(lp: StabilizationLP, w: Floats) -> bool:

@@ -2,8 +2,11 @@
 
 For b >= 0 the smallest nonnegative solution is sum M^k b, finite for every b exactly when the
 spectral radius of M is below 1. Jacobi sweeps from 0 rise to it and keep every iterate >= 0. Where
-they converge slowly a sparse LU factorisation takes over (unless fill would be costly); its answer
-is polished by one refinement step. Whether an answer is good enough is judged by the certificate.
+they converge slowly the system is solved directly, class by class: the strongly connected classes
+of M are visited in an order in which everything a class leads to is known, single cells by
+substitution, larger classes by sparse LU. Values may then span hundreds of decades, as a chain of
+slow classes makes them do, and each class is still solved to its own precision. Whether an answer
+is good enough is judged by the certificate.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import warnings
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -20,6 +24,7 @@ TRIAL_SWEEPS = 60
 MAX_SWEEPS = 200_000
 MAX_FACTORED = 100_000
 TOLERANCE = 2e-15
+CEILING = 1e305
 
 
 def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
@@ -28,7 +33,7 @@ def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
     Parameters
     ----------
     M
-        Sparse array of shape (n, n), entries >= 0.
+        Sparse CSR array of shape (n, n), entries >= 0.
     b
         Shape (n,), entries >= 0.
     start
@@ -38,16 +43,17 @@ def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
     x, change, rate = _sweep(M, b, x, TRIAL_SWEEPS)
     if change <= TOLERANCE:
         return x
-    if len(b) <= MAX_FACTORED and not _soon(change, rate):
-        return _factor(M, b)
-    ceiling = 1e290
+    if not _soon(change, rate):
+        direct, small_enough = solve_by_class(M, b)
+        if direct is not None or small_enough:
+            return direct
     for _ in range(MAX_SWEEPS // TRIAL_SWEEPS):
         x, change, rate = _sweep(M, b, x, TRIAL_SWEEPS)
         if change <= TOLERANCE:
             return x
-        if not np.isfinite(change) or x.max() > ceiling:
+        if not np.isfinite(change) or x.max() > CEILING:
             return None
-    return _factor(M, b)
+    return None
 
 
 def _soon(change: float, rate: float) -> bool:
@@ -57,36 +63,131 @@ def _soon(change: float, rate: float) -> bool:
 def _sweep(M: Any, b: Floats, x: Floats, count: int) -> tuple[Floats, float, float]:
     """Sweep; return x, its last relative change, and the factor by which a sweep shrinks it."""
     halfway = last = np.inf
-    for k in range(count):
-        y = b + M @ x
-        if k in (count // 2, count - 1):
-            top = float(y.max(initial=0.0))
-            with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):
+        for k in range(count):
+            y = b + M @ x
+            if k in (count // 2, count - 1):
+                top = float(y.max(initial=0.0))
                 relative = np.abs(y - x) / np.maximum(y, 1e-14 * top + 1e-300)
-            halfway, last = last, float(relative.max(initial=0.0))
-        x = y
+                halfway, last = last, float(relative.max(initial=0.0))
+            x = y
     rate = (last / halfway) ** (2 / count) if 0 < halfway < np.inf else 0.0
     return x, last, rate
 
 
-def _factor(M: Any, b: Floats) -> Floats | None:
+def solve_by_class(M: Any, b: Floats) -> tuple[Floats | None, bool]:
+    """Solve class by class; return x or None, and whether every class was small enough to try."""
+    from scipy.sparse.csgraph import connected_components
+
+    count, label = connected_components(M, directed=True, connection="strong")
+    size = np.bincount(label, minlength=count)
+    if size.max(initial=0) > MAX_FACTORED:
+        return None, False
+    rank = _topological(M.indptr, M.indices, label, count)
+    order = np.argsort(rank[label], kind="stable")
+    lengths = np.empty(count, dtype=np.int64)
+    lengths[rank] = size
+    ends = np.cumsum(lengths)
+    x = np.zeros(len(b))
+    begun = 0
+    for k in np.append(np.flatnonzero(lengths > 1), count):
+        until = ends[k - 1] if k else 0
+        if not _substitute(M.indptr, M.indices, M.data, order[begun:until], b, x):
+            return None, True
+        if k == count:
+            break
+        cells = order[until : ends[k]]
+        if not _solve_class(M, b, x, cells):
+            return None, True
+        begun = ends[k]
+    return x, True
+
+
+def _solve_class(M: Any, b: Floats, x: Floats, cells: NDArray[np.int64]) -> bool:
+    """Solve one strongly connected class in place; False where it has no finite solution."""
     from scipy.sparse import eye_array
     from scipy.sparse.linalg import splu
 
-    system = (eye_array(len(b), format="csr") - M).tocsc()
+    rows = M[cells]
+    known = b[cells] + rows @ x
+    scale = float(known.max())
+    if scale == 0.0:
+        return True  # nothing is paid here or after: 0, whatever the class does
+    if not np.isfinite(scale):
+        return False
+    inner = rows[:, cells]
+    known /= scale
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            factors = splu(system)
+            factors = splu((eye_array(len(cells), format="csr") - inner).tocsc())
     except (RuntimeError, Warning, MemoryError):
-        return None
-    x = factors.solve(b)
-    x += factors.solve(b - (x - M @ x))
-    if not np.isfinite(x).all():
-        return None
-    top = float(x.max(initial=0.0))
-    if float(x.min(initial=0.0)) < -1e-9 * max(top, 0.0) or (top <= 0 and b.any()):
-        return None
-    x = np.maximum(x, 0.0)
-    residual = np.abs(b + M @ x - x).max(initial=0.0)
-    return x if residual <= 1e-6 * (top + b.max(initial=0.0)) else None
+        return False
+    y = factors.solve(known)
+    y += factors.solve(known - (y - inner @ y))
+    # An irreducible class has a nonnegative solution only if its spectral radius is below 1.
+    if not np.isfinite(y).all() or y.min() < 0 or y.max() > CEILING / scale:
+        return False
+    residual = np.abs(known + inner @ y - y)
+    if not (residual <= 1e-6 * (y + known)).all():
+        return False
+    x[cells] = scale * y
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _topological(indptr, indices, label, count):  # type: ignore[no-untyped-def]
+    """Rank the classes so that every class comes after all it leads to (Kahn's algorithm)."""
+    waits = np.zeros(count, dtype=np.int64)
+    start = np.zeros(count + 1, dtype=np.int64)
+    for i in range(len(label)):
+        for e in range(indptr[i], indptr[i + 1]):
+            if label[i] != label[indices[e]]:
+                waits[label[i]] += 1
+                start[label[indices[e]] + 1] += 1
+    for c in range(count):
+        start[c + 1] += start[c]
+    before = np.empty(start[count], dtype=np.int64)
+    used = start[:-1].copy()
+    for i in range(len(label)):
+        for e in range(indptr[i], indptr[i + 1]):
+            c = label[indices[e]]
+            if label[i] != c:
+                before[used[c]] = label[i]
+                used[c] += 1
+    rank = np.empty(count, dtype=np.int64)
+    queue = np.empty(count, dtype=np.int64)
+    end = 0
+    for c in range(count):
+        if waits[c] == 0:
+            queue[end] = c
+            end += 1
+    for k in range(count):
+        c = queue[k]
+        rank[c] = k
+        for e in range(start[c], start[c + 1]):
+            waits[before[e]] -= 1
+            if waits[before[e]] == 0:
+                queue[end] = before[e]
+                end += 1
+    return rank
+
+
+@njit(cache=True, nogil=True)
+def _substitute(indptr, indices, data, cells, b, x):  # type: ignore[no-untyped-def]
+    """Solve single-cell classes in order; False where staying alone already diverges."""
+    for i in cells:
+        own, known = 0.0, b[i]
+        for e in range(indptr[i], indptr[i + 1]):
+            j = indices[e]
+            if j == i:
+                own += data[e]
+            else:
+                known += data[e] * x[j]
+        if known == 0.0:
+            x[i] = 0.0
+        elif own >= 1.0 or known / (1.0 - own) > CEILING:
+            return False
+        else:
+            x[i] = known / (1.0 - own)
+    return True

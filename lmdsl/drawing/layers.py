@@ -34,7 +34,8 @@ REGIONS: dict[int, tuple[str, str, str | None]] = {
 }
 """Region: name, colour, hatch; greys are cells that cannot be stabilized, by cause."""
 
-MOST_HATCHED = 20_000
+MOST_RUNS = 5_000
+"""Runs of cells that a region is drawn with; beyond, it is an image and has no hatch."""
 
 
 def blank(columns: float = 1, rows: float = 1) -> Any:
@@ -78,7 +79,8 @@ def region(ax: Any, view: View, mask: Bools, code: int, upright: bool = True) ->
 
     One axis makes bands across the other direction, vertical ones if ``upright``.
     """
-    from matplotlib.patches import PathPatch
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Patch, PathPatch
     from matplotlib.path import Path
 
     name, colour, hatch = REGIONS[code]
@@ -87,21 +89,22 @@ def region(ax: Any, view: View, mask: Bools, code: int, upright: bool = True) ->
     boxes = rectangles(
         mask.reshape(len(mask), -1), view.edges(0), across if flat else view.edges(1)
     )
+    if len(boxes) > MOST_RUNS and not flat:
+        image(ax, view, np.where(mask, 1.0, np.nan), ListedColormap([colour])).set_zorder(0.5)
+        return Patch(facecolor=colour, label=name)
     place = ax.transData
     if flat:
         place = ax.get_xaxis_transform() if upright else ax.get_yaxis_transform()
         boxes = boxes if upright else boxes[..., ::-1]
     codes = np.tile([Path.MOVETO, *[Path.LINETO] * 3, Path.CLOSEPOLY], len(boxes))
-    many = len(boxes) > MOST_HATCHED
     patch = PathPatch(
         Path(boxes.reshape(-1, 2), codes),
         facecolor=colour,
         edgecolor=HATCH,
-        hatch=None if many else hatch,
+        hatch=hatch,
         linewidth=0,
         label=name,
         zorder=0.5,
-        rasterized=many,
         transform=place,
     )
     ax.add_patch(patch)
