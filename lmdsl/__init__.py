@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from lmdsl.controller import Simulation as Simulation
     from lmdsl.errors import BadInput as BadInput
     from lmdsl.errors import LmdslError as LmdslError
+    from lmdsl.gamma import GammaBar as GammaBar
+    from lmdsl.gamma import gamma_max as gamma_max
     from lmdsl.graph import CellStatus as CellStatus
     from lmdsl.lp import StabilizationLP as StabilizationLP
     from lmdsl.lp import compile as compile
@@ -37,6 +39,7 @@ _HOME = {
     "Certificate": "certificate",
     "Comparison": "comparison",
     "Controller": "controller",
+    "GammaBar": "gamma",
     "LmdslError": "errors",
     "Problem": "problem",
     "Result": "result",
@@ -45,6 +48,7 @@ _HOME = {
     "Verification": "verification",
     "compare": "comparison",
     "compile": "lp",
+    "gamma_max": "gamma",
     "load": "problem",
     "solve": "stabilize",
     "verify": "verification",

@@ -125,6 +125,10 @@ def _parser() -> argparse.ArgumentParser:
     plot.add_argument("dir", metavar="DIR", help="result directory")
     plot.add_argument("--out", metavar="FILE", help="PNG, PDF or SVG (default DIR/figures.png)")
 
+    limit = command("gamma-max", _gamma_max, "Enclose the largest feasible gamma.")
+    limit.add_argument("file", metavar="FILE", help="problem file")
+    as_json(limit)
+
     command("schema", _schema, "Print the JSON Schema of the problem file.")
     as_json(command("systems", _systems, "List the systems known by name."))
     init = command("init", _init, "Write the default problem of a named system.")
@@ -238,6 +242,27 @@ def _plot(parsed: Arguments) -> int:
     plotting.figure(result, path)
     print(f"written to {safe(str(path))}")
     return 0
+
+
+def _gamma_max(parsed: Arguments) -> int:
+    from lmdsl.gamma import gamma_max
+    from lmdsl.lp import compile
+    from lmdsl.problem import load
+    from lmdsl.result import jsonable
+
+    problem = load(parsed.file)
+    with _Progress() as progress:
+        lp = compile(problem, progress)
+        found = gamma_max(lp, progress) if lp.n else None
+    if parsed.json:
+        _print_json({"gamma_bar": jsonable(found and [found.low, found.high])})
+    elif found is None:
+        print("no cell is stabilizable, so there is no gamma_bar")
+    else:
+        print(f"gamma_bar lies in [{found.low!r}, {found.high!r}]")
+        if found.note:
+            print(f"  {found.note}")
+    return 0 if found else 3
 
 
 def _schema(parsed: Arguments) -> int:

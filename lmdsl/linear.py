@@ -12,6 +12,7 @@ is good enough is judged by the certificate.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ Floats = NDArray[np.float64]
 TRIAL_SWEEPS = 60
 MAX_SWEEPS = 200_000
 MAX_FACTORED = 100_000
+DENSE = 50
 TOLERANCE = 2e-15
 CEILING = 1e305
 
@@ -105,9 +107,6 @@ def solve_by_class(M: Any, b: Floats) -> tuple[Floats | None, bool]:
 
 def _solve_class(M: Any, b: Floats, x: Floats, cells: NDArray[np.int64]) -> bool:
     """Solve one strongly connected class in place; False where it has no finite solution."""
-    from scipy.sparse import eye_array
-    from scipy.sparse.linalg import splu
-
     rows = M[cells]
     known = b[cells] + rows @ x
     scale = float(known.max())
@@ -118,13 +117,11 @@ def _solve_class(M: Any, b: Floats, x: Floats, cells: NDArray[np.int64]) -> bool
     inner = rows[:, cells]
     known /= scale
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            factors = splu((eye_array(len(cells), format="csr") - inner).tocsc())
-    except (RuntimeError, Warning, MemoryError):
+        solver = _dense(inner) if len(cells) <= DENSE else _factors(inner)
+        y = solver(known)
+        y += solver(known - (y - inner @ y))
+    except (RuntimeError, Warning, MemoryError, np.linalg.LinAlgError):
         return False
-    y = factors.solve(known)
-    y += factors.solve(known - (y - inner @ y))
     # An irreducible class has a nonnegative solution only if its spectral radius is below 1.
     if not np.isfinite(y).all() or y.min() < 0 or y.max() > CEILING / scale:
         return False
@@ -133,6 +130,23 @@ def _solve_class(M: Any, b: Floats, x: Floats, cells: NDArray[np.int64]) -> bool
         return False
     x[cells] = scale * y
     return True
+
+
+def _factors(inner: Any) -> Callable[[Floats], Floats]:
+    from scipy.sparse import eye_array
+    from scipy.sparse.linalg import splu
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solver: Callable[[Floats], Floats] = splu(
+            (eye_array(inner.shape[0], format="csr") - inner).tocsc()
+        ).solve
+    return solver
+
+
+def _dense(inner: Any) -> Callable[[Floats], Floats]:
+    system = np.eye(inner.shape[0]) - inner.toarray()
+    return lambda known: np.linalg.solve(system, known)
 
 
 @njit(cache=True, nogil=True)

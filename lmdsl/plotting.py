@@ -107,7 +107,7 @@ def portrait(
     first[:, shown_axes] = partition.low[shown_axes] + place * span
     points = runs.open_loop(given, partition, first, u, steps or (60 if lines else 300), fine=lines)
     layers.orbits(drawn, view, points, place[:, 1], lines)
-    layers.outline(drawn, view, view.shadow(attractor), layers.ATTRACTOR)
+    layers.outline(drawn, view, view.shadow(attractor), layers.ATTRACTOR, 1.6)
     return drawn
 
 

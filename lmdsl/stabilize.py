@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import backends, bellman, certificate, policy
+from lmdsl import backends, bellman, certificate, gamma, policy
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.scaled import failure
 from lmdsl.certificate import Certificate, Verified, Witness
@@ -86,12 +86,13 @@ def solve(
         w = verified.witness.w
         if verified.certificate.refusal and w is not None:
             job.solve_seconds = time.perf_counter() - started
+            limits = gamma.bracket(lp)
+            bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
             message = (
-                f"gamma = {lp.gamma!r} is not below gamma_bar: proved that no control makes the "
-                f"cost finite from {int((w > 0).sum())} cells; "
-                f"lower gamma (it works at {first.lower:.9g})"
+                f"gamma = {lp.gamma!r} is not below gamma_bar, which lies in "
+                f"[{bracket[0]:.9g}, {bracket[1]:.9g}]: proved that no control makes the cost "
+                f"finite from {int((w > 0).sum())} cells; lower gamma"
             )
-            bracket = (first.lower, lp.gamma)
             return job.refused("gamma", message, verified, bracket)
         first = policy.Undecided(first.pair, first.lower)
     options = Options(

@@ -35,6 +35,7 @@ lp
 bellman linear
 bounds
 policy
+gamma
 backends.base
 backends.scaled
 backends
@@ -54,9 +55,10 @@ __main__
 """
 
 PUBLIC = [
-    "BadInput", "CellStatus", "Certificate", "Comparison", "Controller", "LmdslError", "Problem",
-    "Result", "Simulation", "StabilizationLP", "Verification", "__version__", "backends",
-    "compare", "compile", "load", "plotting", "solve", "systems", "verify",
+    "BadInput", "CellStatus", "Certificate", "Comparison", "Controller", "GammaBar",
+    "LmdslError", "Problem", "Result", "Simulation", "StabilizationLP", "Verification",
+    "__version__", "backends", "compare", "compile", "gamma_max", "load", "plotting", "solve",
+    "systems", "verify",
 ]  # fmt: skip
 
 # Imports inside functions against the order, each with its reason.

@@ -111,7 +111,7 @@ def region(ax: Any, view: View, mask: Bools, code: int, upright: bool = True) ->
     return patch
 
 
-def outline(ax: Any, view: View, mask: Bools, colour: str) -> None:
+def outline(ax: Any, view: View, mask: Bools, colour: str, width: float = 0.9) -> None:
     """Outline the attractor, and ring its parts that are too small to see."""
     from matplotlib.collections import LineCollection
     from scipy.ndimage import find_objects, label
@@ -123,17 +123,17 @@ def outline(ax: Any, view: View, mask: Bools, colour: str) -> None:
     i, j = np.nonzero(padded[1:-1, 1:] != padded[1:-1, :-1])
     level = np.stack([np.stack([x[i], y[j]], -1), np.stack([x[i + 1], y[j]], -1)], 1)
     lines: Any = np.concatenate([upright, level])
-    ax.add_collection(LineCollection(lines, colors=colour, linewidths=0.9, zorder=3.1))
+    ax.add_collection(LineCollection(lines, colors=colour, linewidths=width, zorder=3.1))
     for part in find_objects(label(mask)[0])[:100]:
         if all((q.stop - q.start) < 0.03 * n for q, n in zip(part, mask.shape, strict=True)):
             centre = [(e[q.start] + e[q.stop]) / 2 for e, q in zip((x, y), part, strict=True)]
-            for ink, width in (("white", 2.4), (ATTRACTOR, 1.3)):
+            for ink, size in (("white", 2.4), (ATTRACTOR, 1.3)):
                 ax.scatter(
                     *centre,
                     s=75,
                     facecolors="none",
                     edgecolors=ink,
-                    linewidths=width,
+                    linewidths=size,
                     zorder=3.2,
                 )
 
