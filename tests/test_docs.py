@@ -343,7 +343,7 @@ def test_every_public_name_is_described():
     for module in (lm.systems, lm.backends):
         assert not missing(module.__all__, text)
     for record in (lm.StabilizationLP, lm.Certificate, lm.Controller, lm.Simulation,
-                   lm.Comparison, lm.Verification, lm.Result):  # fmt: skip
+                   lm.Comparison, lm.Verification, lm.GammaBar, lm.Result):  # fmt: skip
         described = text + doc("command-line.md")
         assert not missing(members(record), described), record.__name__
     own = {name for name in vars(lm.Problem) if not name.startswith("_")}
@@ -351,7 +351,7 @@ def test_every_public_name_is_described():
     assert not missing({name for name in own if callable(getattr(lm.Problem, name, None))}, text)
 
 
-@pytest.mark.parametrize("name", ["solve", "compare", "compile", "load", "verify"])
+@pytest.mark.parametrize("name", ["solve", "compare", "compile", "gamma_max", "load", "verify"])
 def test_signatures_are_as_described(name):
     check_signature(f"lm.{name}", getattr(lm, name))
 
