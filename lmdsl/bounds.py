@@ -9,6 +9,7 @@ doubles G, gamma, V are read as they stand and a transition is numerator / total
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 
 import numpy as np
@@ -137,6 +138,34 @@ def raise_from_zero(lp: StabilizationLP, gamma: float, cost: Floats, sweeps: int
             return y
         x = y
     return x
+
+
+def weighted(weight: Floats, values: Floats, direction: float) -> float:
+    """Return weight'values rounded towards ``direction`` (an infinity), for values >= 0.
+
+    Products are split exactly (Dekker) and summed exactly, so the result is the double nearest to
+    the exact sum on the side asked for.
+    """
+    top = float(values.max(initial=0.0))
+    if not np.isfinite(top) or top > 1e280:
+        with np.errstate(over="ignore"):
+            rough = math.fsum(weight * values) if np.isfinite(top) else math.inf
+        return rough * (1 + math.copysign(4 * UNIT, direction))
+    product = weight * values
+    a, b = _halves(weight), _halves(values)
+    error = ((a[0] * b[0] - product) + a[0] * b[1] + a[1] * b[0]) + a[1] * b[1]
+    terms = [*product.tolist(), *error.tolist()]
+    near = math.fsum(terms)
+    beyond = math.fsum([*terms, -near])  # what rounding to nearest left out
+    outward = beyond > 0 if direction > 0 else beyond < 0
+    return float(np.nextafter(near, direction)) if outward else near
+
+
+def _halves(x: Floats) -> tuple[Floats, Floats]:
+    """Split doubles into two of 26 bits each, whose products are exact."""
+    c = 134217729.0 * x
+    high = c - (c - x)
+    return high, x - high
 
 
 def _rounded_down(value: Fraction) -> float:

@@ -48,7 +48,7 @@ class Certificate:
     contraction
         Proved bound on rho(g P_u), None where claim 1 does not hold.
     cost, lower, gap
-        m'V_up, m'W and the gap; None where not established.
+        m'V_up rounded up, m'W rounded down, and the gap; None where not established.
     measure_residual
         ||m - mu + gamma P_u'mu||_1, rounded up; None where there is no mu.
     tolerance
@@ -198,8 +198,11 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
     upper = pair is not None and V_up is not None and check_upper(lp, pair, V_up)
     lower = W is not None and check_lower(lp, W)
     residual = None if pair is None or mu is None else check_measure(lp, pair, mu)
-    cost = weighted(lp, V_up) if upper and V_up is not None else None
-    floor = weighted(lp, W) if lower and W is not None else None
+    cost = floor = None
+    if upper and V_up is not None:
+        cost = bounds.weighted(lp.weight, V_up, math.inf)
+    if lower and W is not None:
+        floor = bounds.weighted(lp.weight, W, -math.inf)
     certificate = Certificate(
         stabilizing=contraction is not None,
         upper_bound=upper,
@@ -217,7 +220,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
 
 
 def weighted(lp: StabilizationLP, values: Floats) -> float:
-    """Return m'values, summed exactly."""
+    """Return m'values, rounded to nearest."""
     return math.fsum(lp.weight * values)
 
 
@@ -270,7 +273,8 @@ def gap(lp: StabilizationLP, V_up: Floats | None, W: Floats | None) -> float:
     """Return m'(V_up - W) / m'V_up, rounded up; 0 if m'V_up = 0, infinite if one is missing."""
     if V_up is None or W is None:
         return math.inf
-    cost = weighted(lp, V_up)
+    cost = bounds.weighted(lp.weight, V_up, math.inf)
     if cost == 0:
         return 0.0
-    return max(weighted(lp, V_up - W) / cost * (1 + 8 * bounds.UNIT), 0.0)
+    width = bounds.weighted(lp.weight, np.maximum(V_up - W, 0.0), math.inf)
+    return width / cost * (1 + 8 * bounds.UNIT)

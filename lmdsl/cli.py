@@ -57,12 +57,15 @@ def _fail(message: str, status: int) -> int:
 
 
 def _bad(parsed: Arguments, message: str) -> int:
-    if getattr(parsed, "json", False) and parsed.command in ("solve", "compare"):
+    if getattr(parsed, "json", False):
         from lmdsl.result import Report
 
-        report = Report(status="bad_input", message=message).to_dict()
-        _print_json(report if parsed.command == "solve" else {"results": [report],
-                                                              "agreement": None})  # fmt: skip
+        report: dict[str, Any] = Report(status="bad_input", message=message).to_dict()
+        if parsed.command == "compare":
+            report = {"results": [report], "agreement": None}
+        elif parsed.command != "solve":
+            report = {"status": "bad_input", "message": message}
+        _print_json(report)
     return _fail(message, 2)
 
 
@@ -206,6 +209,9 @@ def _verify(parsed: Arguments) -> int:
         _print_json(found.to_dict())
     else:
         print(f"{found.status}: " + ("every claim holds" if found.holds else "NOT confirmed"))
+        gap = found.certificate.gap
+        if gap is not None:
+            print(f"  gap {gap:.2g}, tolerance {found.certificate.tolerance:.2g}")
         for sentence in (*found.reasons, *found.notes):
             print(f"  {safe(sentence)}")
         print("  (claims speak of the finite model: cells and sampled transitions)")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl import backends, bellman
-from lmdsl.errors import BadInput
+from lmdsl.errors import BadInput, shown
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.result import Result
@@ -129,6 +129,10 @@ def compare(
     BadInput
         As for :func:`lmdsl.solve`; also where no backend is named.
     """
+    if isinstance(backends, str):
+        raise BadInput(f"name the backends in a list: [{shown(backends)}]", "backends")
+    if not isinstance(problem, Problem | StabilizationLP):
+        raise BadInput(f"{shown(problem)} is neither a Problem nor a compiled LP", "problem")
     if not backends:
         raise BadInput("no backend is named; name at least one", "backends")
     lp = compile(problem, progress) if isinstance(problem, Problem) else problem

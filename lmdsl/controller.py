@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lmdsl.errors import BadInput
+from lmdsl.errors import BadInput, shown
 from lmdsl.graph import CellStatus
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
@@ -49,10 +49,13 @@ class Controller:
         Returns
         -------
         ndarray, shape (..., p)
-            NaN where there is no control: off the stabilizable set, outside the box, and on the
-            attractor cells.
+            NaN where there is no control: off the stabilizable set, on the attractor cells, and
+            outside the box (with ``on_exit: clip``, a state outside is clipped into it first).
         """
-        states = np.asarray(x, dtype=np.float64)
+        try:
+            states = np.asarray(x, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise BadInput(f"{shown(x)} is no array of states") from None
         d = self.partition.dimension
         if states.shape[-1:] != (d,):
             raise BadInput(f"states have shape (..., {d}), not {states.shape}")

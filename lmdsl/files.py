@@ -63,7 +63,7 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise BadInput(f"cannot read {shown(str(path), 200)}: {reason}") from None
-    except ValueError:
+    except (TypeError, ValueError):
         raise BadInput(f"{shown(str(path), 200)} is not a path") from None
     if len(content) > limit:
         raise BadInput(f"{shown(str(path), 200)} is larger than the limit of {limit} bytes")

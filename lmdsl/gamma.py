@@ -93,8 +93,8 @@ def gamma_max(problem: Problem | StabilizationLP, progress: Progress | None = No
     return bracket(lp)
 
 
-def bracket(lp: StabilizationLP, limit: int = 60) -> GammaBar:
-    """Enclose gamma_bar of a model with at least one cell."""
+def bracket(lp: StabilizationLP, stop: policy.Stop = lambda: False, limit: int = 60) -> GammaBar:
+    """Enclose gamma_bar of a model with at least one cell; ``stop`` ends the work early."""
     certain = exhausted_by_levels(lp)
     if certain is not None:
         return GammaBar(math.inf, math.inf, certain, None, None)
@@ -102,6 +102,8 @@ def bracket(lp: StabilizationLP, limit: int = 60) -> GammaBar:
     high, w_high = math.inf, None
     overflow = False
     for _ in range(limit):
+        if stop():
+            break
         climbed = _climb(lp, best)
         if climbed is not None and climbed.low > best.low:
             best = climbed
@@ -122,7 +124,7 @@ def bracket(lp: StabilizationLP, limit: int = 60) -> GammaBar:
     note = ""
     if high > best.low * (1 + WIDTH):
         note = "the vectors leave the range of doubles; the bracket is as tight as they allow"
-        note = note if overflow else "the bracket did not close within the iteration limit"
+        note = note if overflow else "the work was ended before the bracket closed"
     return GammaBar(best.low, high, best.pair, best.w_low, w_high, note)
 
 

@@ -23,7 +23,7 @@ from lmdsl.files import write_whole
 from lmdsl.graph import CellStatus, Predecessors
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.rows import Rows
+from lmdsl.rows import Rows, freeze
 from lmdsl.sampling import control_vectors
 from lmdsl.transitions import Progress, assemble
 
@@ -76,6 +76,10 @@ class StabilizationLP:
     gamma: float
     weight: Floats
 
+    def __post_init__(self) -> None:
+        freeze(self.controls, self.cell_status, self.cells, self.pair_pointer, self.control)
+        freeze(self.cost, self.weight)
+
     @property
     def n(self) -> int:
         """Number of cells of C: rows of the LP."""
@@ -89,7 +93,9 @@ class StabilizationLP:
     @cached_property
     def cell(self) -> NDArray[np.int32]:
         """The cell of every column as a position in ``cells``, shape (K,)."""
-        return graph.owner(self.pair_pointer)
+        cell = graph.owner(self.pair_pointer)
+        freeze(cell)
+        return cell
 
     @property
     def A(self) -> Any:
@@ -121,7 +127,7 @@ class StabilizationLP:
 
     @property
     def growth(self) -> float:
-        """G = max(gamma, 1): the weight under which a policy must be stabilizing."""
+        """The weight g = max(gamma, 1) under which a policy must be stabilizing."""
         return max(self.gamma, 1.0)
 
     def column(self, cell: int, control: int) -> int | None:

@@ -4,9 +4,10 @@ A policy is an array of columns, one per cell of C (``pair``). P_u, G_u are its 
 *gamma-stabilizing* when the spectral radius of gamma P_u is below 1; then its value
 V = G_u + gamma P_u V is finite. Write g = max(gamma, 1).
 
-Howard's policy iteration from a g-stabilizing policy that changes a control only where strictly
-better keeps every policy g-stabilizing, zeros in the cost included: on a recurrent class of a bad
-new policy, V >= gamma P V + G forces equality everywhere, so nothing there was changed.
+For gamma >= 1, Howard's policy iteration from a gamma-stabilizing policy that changes a control
+only where strictly better keeps every policy gamma-stabilizing, zeros in the cost included: on a
+recurrent class of a bad new policy, V >= gamma P V + G forces equality everywhere, so nothing
+there was changed.
 """
 
 from __future__ import annotations

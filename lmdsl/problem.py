@@ -219,7 +219,10 @@ def load(path: str | os.PathLike[str]) -> Problem:
     BadInput
         The file cannot be read, is no strict JSON, or declares no valid problem.
     """
-    data = read_json(Path(path))
+    try:
+        data = read_json(Path(path))
+    except TypeError:
+        raise BadInput(f"{shown(path)} is not a path") from None
     for key in ("format", "system", "state_box", "attractor"):
         if isinstance(data, dict) and key not in data:
             raise BadInput("required key is missing; add it", key)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lmdsl.certificate import Certificate
 from lmdsl.controller import ClosedLoop, Controller, Simulation, simulate
-from lmdsl.errors import BadInput
+from lmdsl.errors import BadInput, shown
 from lmdsl.graph import CellStatus
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
@@ -197,8 +197,10 @@ class Result(Report):
             There is no controller, or a count is not positive.
         """
         for name, count in (("starts", starts), ("steps", steps)):
-            if count < 1:
-                raise BadInput(f"{count} is not a positive number", name)
+            if not isinstance(count, int | np.integer) or count < 1:
+                raise BadInput(f"{shown(count)} is not a whole number >= 1", name)
+        if not isinstance(seed, int | np.integer) or seed < 0:
+            raise BadInput(f"{shown(seed)} is not a whole number >= 0", "seed")
         if (self.control_index < 0).all():
             raise BadInput("there is no controller to simulate: " + self.message)
         cells = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)

@@ -14,6 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,9 @@ class Shares:
     numerator: tuple[int, ...]
     total: int
     value: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        freeze(self.value)
 
     @classmethod
     def of(cls, points: int, nodes: Nodes) -> Shares:
@@ -81,6 +85,9 @@ class Rows:
     shares: Shares
     columns: int
 
+    def __post_init__(self) -> None:
+        freeze(self.pointer, self.target, self.code)
+
     @property
     def count(self) -> int:
         """Number of rows."""
@@ -123,6 +130,12 @@ class Rows:
         )
         matrix.sum_duplicates()
         return matrix
+
+
+def freeze(*arrays: NDArray[Any]) -> None:
+    """Make arrays read-only: a certificate must be about the model that was compiled."""
+    for array in arrays:
+        array.setflags(write=False)
 
 
 def code_type(codes: int) -> type[np.unsignedinteger]:

@@ -13,7 +13,7 @@ from lmdsl import backends, bellman, certificate, gamma, policy
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.scaled import failure
 from lmdsl.certificate import Certificate, Verified, Witness
-from lmdsl.errors import BadInput
+from lmdsl.errors import BadInput, shown
 from lmdsl.graph import CellStatus
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
@@ -65,7 +65,7 @@ def solve(
     BadInput
         The problem or an option cannot be used.
     """
-    _check_options(tolerance, time_limit, max_iterations)
+    _check_options(problem, tolerance, time_limit, max_iterations)
     chosen, algorithm = backends.resolve(backend)
     started = time.perf_counter()
     lp = compile(problem, progress) if isinstance(problem, Problem) else problem
@@ -86,7 +86,7 @@ def solve(
         w = verified.witness.w
         if verified.certificate.refusal and w is not None:
             job.solve_seconds = time.perf_counter() - started
-            limits = gamma.bracket(lp)
+            limits = gamma.bracket(lp, late)
             bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
             message = (
                 f"gamma = {lp.gamma!r} is not below gamma_bar, which lies in "
@@ -122,18 +122,28 @@ def solve(
     return job.solved(solution, outcome, verified, undecided)
 
 
-def _check_options(tolerance: float, time_limit: float | None, max_iterations: int | None) -> None:
-    if not 0 <= tolerance < np.inf:
-        raise BadInput(f"{tolerance!r} must be a finite number >= 0", "tolerance")
-    if time_limit is not None and not time_limit > 0:
-        raise BadInput(f"{time_limit!r} must be a number of seconds > 0", "time_limit")
-    if max_iterations is not None and max_iterations < 1:
-        raise BadInput(f"{max_iterations!r} must be at least 1", "max_iterations")
+def _check_options(problem: Any, tolerance: Any, time_limit: Any, max_iterations: Any) -> None:
+    if not isinstance(problem, Problem | StabilizationLP):
+        raise BadInput(f"{shown(problem)} is neither a Problem nor a compiled LP", "problem")
+    if not _number(tolerance) or not 0 <= tolerance < np.inf:
+        raise BadInput(f"{shown(tolerance)} must be a finite number >= 0", "tolerance")
+    if time_limit is not None and (not _number(time_limit) or not time_limit > 0):
+        raise BadInput(f"{shown(time_limit)} must be a number of seconds > 0", "time_limit")
+    if max_iterations is not None and not (
+        isinstance(max_iterations, int | np.integer) and max_iterations >= 1
+    ):
+        raise BadInput(f"{shown(max_iterations)} must be a whole number >= 1", "max_iterations")
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, float | int | np.floating | np.integer) and value is not True
 
 
 def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[str, str] | None:
     """Return the cause and a sentence where the graph alone rules the problem out."""
     if not lp.n:
+        if not np.isin(lp.cell_status, (2, 3, 4)).any():
+            return "empty", "every cell is attractor or avoid; there is nothing to stabilize"
         return "empty", "no cell can be kept in the box and brought to the attractor"
     if not lp.weight.any():
         return "measure", "no cell of measure is stabilizable; enlarge its boxes"

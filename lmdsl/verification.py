@@ -67,6 +67,7 @@ class Verification:
             "cost": jsonable(proof.cost),
             "lower_bound": jsonable(proof.lower),
             "gap": jsonable(proof.gap),
+            "tolerance": jsonable(proof.tolerance),
             "contraction": jsonable(proof.contraction),
             "reasons": list(self.reasons),
             "notes": list(self.notes),
@@ -102,6 +103,15 @@ def verify(path: str | os.PathLike[str], progress: Progress | None = None) -> Ve
     reasons: list[str] = []
     if not np.array_equal(lp.cell_status, result.cell_status):
         reasons.append("cell_status differs from the recompiled model")
+    for name, count in (
+        ("cells", lp.partition.size),
+        ("controls", len(lp.controls)),
+        ("pairs", lp.K),
+        ("attractor_cells", int((lp.cell_status == CellStatus.ATTRACTOR).sum())),
+        ("stabilizable_cells", lp.n),
+    ):
+        if getattr(result, name) != count:
+            reasons.append(f"{name} is stored as {getattr(result, name)!r}, but is {count}")
     if result.status == "not_stabilizable":
         certificate = _judge_refusal(lp, result, reasons)
     else:

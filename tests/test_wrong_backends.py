@@ -132,3 +132,47 @@ def test_a_missing_package_is_named():
         patch.setattr("lmdsl.backends.highs.BACKEND", monkey)
         with pytest.raises(lm.BadInput, match="no_such_package"):
             lm.solve(made(steps()), "highs")
+
+
+def test_a_backend_cannot_change_the_model():
+    lp = lm.compile(made(standard_map(10)))
+
+    def cheat(lp, options):
+        lp.cost[:] = 0
+        return Solution(Stop.OPTIMAL, "optimal", value=np.zeros(lp.n))
+
+    result = lm.solve(lp, backend(cheat))
+    assert result.cost == lm.solve(lp).cost
+    assert "read-only" in result.solver_status
+    for array in (lp.cost, lp.weight, lp.pair_pointer, lp.control, lp.cells, lp.cell,
+                  lp.rows.pointer, lp.rows.target, lp.rows.code, lp.rows.shares.value):  # fmt: skip
+        assert not array.flags.writeable
+
+
+def test_numbers_of_numpy_are_saved(tmp_path):
+    def numpy_numbers(lp, options):
+        return Solution(Stop.OPTIMAL, "ok", pair=lp.tree[1], iterations=np.int64(3))
+
+    lm.solve(made(steps()), backend(numpy_numbers)).save(tmp_path / "out")
+    assert lm.Result.load(tmp_path / "out").iterations == 3
+
+
+def test_arguments_of_the_wrong_kind_are_bad_input():
+    problem = made(steps())
+    result = lm.solve(problem)
+    for call in (
+        lambda: lm.solve(0),
+        lambda: lm.solve("file.json"),
+        lambda: lm.solve(problem, tolerance="x"),
+        lambda: lm.solve(problem, time_limit="x"),
+        lambda: lm.solve(problem, max_iterations=1.5),
+        lambda: lm.compare(problem, "highs"),
+        lambda: lm.compare(0),
+        lambda: lm.load(None),
+        lambda: result.simulate(starts=2.5),
+        lambda: result.simulate(seed=-1),
+        lambda: result.controller("a"),
+        lambda: result.controller([1, 2]),
+    ):
+        with pytest.raises(lm.BadInput):
+            call()
