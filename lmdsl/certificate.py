@@ -192,7 +192,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
     """
     pair = witness.pair
     V_up, W, mu, w = witness.V_up, witness.W, witness.mu, witness.w
-    if pair is not None and not _is_policy(lp, pair):
+    if pair is not None and not is_policy(lp, pair):
         pair = None
     contraction = None if pair is None or w is None else check_stabilizing(lp, pair, w)
     upper = pair is not None and V_up is not None and check_upper(lp, pair, V_up)
@@ -216,7 +216,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
         measure_residual=residual,
         tolerance=tolerance,
     )
-    return _explained(lp, pair, certificate)
+    return explained(lp, pair, certificate)
 
 
 def weighted(lp: StabilizationLP, values: Floats) -> float:
@@ -224,13 +224,15 @@ def weighted(lp: StabilizationLP, values: Floats) -> float:
     return math.fsum(lp.weight * values)
 
 
-def _is_policy(lp: StabilizationLP, pair: Pairs) -> bool:
+def is_policy(lp: StabilizationLP, pair: Pairs) -> bool:
+    """Return whether an array names one column of every cell's own."""
     if pair.shape != (lp.n,) or not lp.n:
         return False
     return bool((pair >= lp.pair_pointer[:-1]).all() and (pair < lp.pair_pointer[1:]).all())
 
 
-def _explained(lp: StabilizationLP, pair: Pairs | None, certificate: Certificate) -> Certificate:
+def explained(lp: StabilizationLP, pair: Pairs | None, certificate: Certificate) -> Certificate:
+    """Return the certificate with the reasons why it is not verified."""
     reasons = []
     if certificate.refusal:
         reasons.append(f"proved: no policy has finite cost at gamma = {lp.gamma!r}")

@@ -115,6 +115,8 @@ def _parser() -> argparse.ArgumentParser:
 
     verify = command("verify", _verify, "Recompile a saved result and check every claim.")
     verify.add_argument("dir", metavar="DIR", help="result directory")
+    verify.add_argument("--exact", action="store_true",
+                        help="judge in rational arithmetic, without tolerance")  # fmt: skip
     as_json(verify)
 
     simulate = command("simulate", _simulate, "Run the true map under a saved controller.")
@@ -204,7 +206,7 @@ def _verify(parsed: Arguments) -> int:
     from lmdsl.verification import verify
 
     with _Progress() as progress:
-        found = verify(parsed.dir, progress)
+        found = verify(parsed.dir, parsed.exact, progress)
     if parsed.json:
         _print_json(found.to_dict())
     else:

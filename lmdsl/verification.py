@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from lmdsl import archive
 from lmdsl.certificate import CLAIMS, Certificate, Witness, check
 from lmdsl.errors import BadInput
+from lmdsl.exact import check_exactly
 from lmdsl.graph import CellStatus
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.regions import Regions
@@ -26,6 +28,7 @@ from lmdsl.sampling import noise_nodes, sample_points
 from lmdsl.systems import FunctionSystem
 from lmdsl.transitions import Progress
 
+Judge = Callable[[StabilizationLP, Witness, float], Certificate]
 LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
 
 
@@ -74,13 +77,17 @@ class Verification:
         }
 
 
-def verify(path: str | os.PathLike[str], progress: Progress | None = None) -> Verification:
+def verify(
+    path: str | os.PathLike[str], exact: bool = False, progress: Progress | None = None
+) -> Verification:
     """Recompile the problem of a result directory and check every claim it makes.
 
     Parameters
     ----------
     path
         The result directory.
+    exact
+        Judge in rational arithmetic, without tolerance on claims 1 to 3 (slower).
     progress
         Called with (stage, fraction done) during long work.
 
@@ -89,6 +96,7 @@ def verify(path: str | os.PathLike[str], progress: Progress | None = None) -> Ve
     BadInput
         The directory cannot be read.
     """
+    judge = check_exactly if exact else check
     result = archive.load(path)
     notes: list[str] = []
     if isinstance(result.problem.system, FunctionSystem):
@@ -113,22 +121,24 @@ def verify(path: str | os.PathLike[str], progress: Progress | None = None) -> Ve
         if getattr(result, name) != count:
             reasons.append(f"{name} is stored as {getattr(result, name)!r}, but is {count}")
     if result.status == "not_stabilizable":
-        certificate = _judge_refusal(lp, result, reasons)
+        certificate = _judge_refusal(lp, result, reasons, judge)
     else:
-        certificate = _judge_claims(lp, result, reasons)
+        certificate = _judge_claims(lp, result, reasons, judge)
         if result.status != "verified":
             reasons.append(f"the status is {result.status}, not verified")
     return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
 
 
-def _judge_claims(lp: StabilizationLP, result: Result, reasons: list[str]) -> Certificate:
+def _judge_claims(
+    lp: StabilizationLP, result: Result, reasons: list[str], judge: Judge
+) -> Certificate:
     pair = _policy(lp, result)
     if pair is None:
         reasons.append("control_index is no policy on the stabilizable set")
     on = lp.cells
     V_up, W = result.value[on], result.lower[on]
     witness = Witness(pair, result.witness[on], V_up, W, result.measure[on])
-    certificate = check(lp, witness, result.tolerance or 0.0)
+    certificate = judge(lp, witness, result.tolerance or 0.0)
     reasons += certificate.reasons
     claimed = (
         ("cost", certificate.cost, result.cost, True),
@@ -163,9 +173,11 @@ def _judge_outside(lp: StabilizationLP, result: Result, reasons: list[str]) -> N
             reasons.append(f"{name} has a wrong value outside the stabilizable set")
 
 
-def _judge_refusal(lp: StabilizationLP, result: Result, reasons: list[str]) -> Certificate:
+def _judge_refusal(
+    lp: StabilizationLP, result: Result, reasons: list[str], judge: Judge
+) -> Certificate:
     witness = Witness(None, result.witness[lp.cells])
-    certificate = check(lp, witness, result.tolerance or 0.0)
+    certificate = judge(lp, witness, result.tolerance or 0.0)
     proved = {
         "empty": not lp.n,
         "measure": bool(lp.n) and not lp.weight.any(),

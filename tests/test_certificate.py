@@ -16,6 +16,7 @@ import lmdsl as lm
 from lmdsl import policy, witness
 from lmdsl.bounds import exactly_below, holds_for_all
 from lmdsl.certificate import Witness, check
+from lmdsl.exact import check_exactly
 from lmdsl.rows import Rows
 
 
@@ -31,7 +32,16 @@ def solved():
 
 
 def judged(lp, witness, **changes):
-    return check(lp, replace(witness, **changes), 1e-6)
+    """Judge twice, fast and in rational arithmetic; the fast check may only be stricter."""
+    changed = replace(witness, **changes)
+    fast, exact = check(lp, changed, 1e-6), check_exactly(lp, changed, 1e-6)
+    for claim in ("stabilizing", "upper_bound", "lower_bound", "measure", "refusal"):
+        assert getattr(exact, claim) >= getattr(fast, claim), claim
+    for name, outward in (("cost", 1), ("contraction", 1), ("gap", 1), ("lower", -1)):
+        loose, tight = getattr(fast, name), getattr(exact, name)
+        if loose is not None:
+            assert outward * loose >= outward * tight, name
+    return fast if fast.verified else exact
 
 
 def spoiled(array, i, value):

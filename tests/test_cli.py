@@ -71,6 +71,10 @@ def test_solve_and_everything_after(capsys, file, tmp_path):
     assert status == 0
     assert found["holds"]
     assert found["same_model"]
+    status, exact = run_json(capsys, "verify", out, "--exact")
+    assert status == 0
+    assert exact["holds"]
+    assert exact["gap"] <= found["gap"]
     status, runs = run_json(capsys, "simulate", out, "--starts", 200, "--steps", 500)
     assert status == 0
     assert runs["starts"] == 200 == runs["reached"] + runs["lost"] + runs["cycling"]

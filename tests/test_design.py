@@ -42,6 +42,7 @@ backends
 backends.*
 certificate
 witness
+exact
 controller
 result
 archive
