@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lmdsl import backends as backends
+    from lmdsl import exports as exports
     from lmdsl import plotting as plotting
     from lmdsl import systems as systems
+    from lmdsl import testing as testing
     from lmdsl.certificate import Certificate as Certificate
     from lmdsl.comparison import Comparison as Comparison
     from lmdsl.comparison import compare as compare
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from lmdsl.controller import Simulation as Simulation
     from lmdsl.errors import BadInput as BadInput
     from lmdsl.errors import LmdslError as LmdslError
+    from lmdsl.explanation import explain as explain
     from lmdsl.gamma import GammaBar as GammaBar
     from lmdsl.gamma import gamma_max as gamma_max
     from lmdsl.graph import CellStatus as CellStatus
@@ -48,12 +51,13 @@ _HOME = {
     "Verification": "verification",
     "compare": "comparison",
     "compile": "lp",
+    "explain": "explanation",
     "gamma_max": "gamma",
     "load": "problem",
     "solve": "stabilize",
     "verify": "verification",
 }
-_MODULES = ("backends", "plotting", "systems")
+_MODULES = ("backends", "exports", "plotting", "systems", "testing")
 
 __all__ = ["__version__", *_HOME, *_MODULES]
 

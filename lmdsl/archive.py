@@ -13,6 +13,7 @@ import io
 import json
 import os
 import shutil
+import sys
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -22,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl import memory
 from lmdsl.certificate import CLAIMS, Certificate
 from lmdsl.errors import BadInput, shown
 from lmdsl.files import read_json
@@ -29,7 +31,7 @@ from lmdsl.lp import StabilizationLP
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem, parse_problem
 from lmdsl.result import ARRAYS, EXIT, Report, Result, Seconds, jsonable
-from lmdsl.sampling import control_vectors
+from lmdsl.sampling import control_count, control_vectors
 from lmdsl.systems import FunctionSystem
 
 FORMAT = "lmdsl-result/1"
@@ -213,13 +215,15 @@ def load(path: str | os.PathLike[str]) -> Result:
     stored = read_certificate(folder)
     partition = Partition.of(problem)
     N = partition.size
+    M = min(control_count(problem), 10**40)
+    memory.require(64 * N + 8 * M * (2 + len(problem.control_grid)), "arrays of the result")
     expected = {name: ((N,), kind) for name, kind in TYPES.items()}
     arrays = read_arrays(folder / "solution.npz", expected)
     vectors = control_vectors(problem)
     index = arrays["control_index"]
     if index.size and not (index.min() >= -1 and index.max() < len(vectors)):
         raise BadInput("control_index holds an index outside the control grid", "solution.npz")
-    if arrays["cell_status"].max(initial=0) > 5:
+    if arrays["cell_status"].max(initial=0) > 6:
         raise BadInput("cell_status holds an unknown code", "solution.npz")
     scalars = {
         key: stored[key]
@@ -299,6 +303,15 @@ _SHAPE: dict[str, Any] = {
 }
 
 
+def _finite(value: Any) -> bool:
+    """Return whether a stored number is unknown or within the range of doubles."""
+    if value is None:
+        return True
+    if not isinstance(value, float | int) or isinstance(value, bool):
+        return False
+    return abs(value) <= sys.float_info.max
+
+
 def read_certificate(folder: Path) -> dict[str, Any]:
     """Read certificate.json and check that every key has its type."""
     where = "certificate.json"
@@ -308,15 +321,20 @@ def read_certificate(folder: Path) -> dict[str, Any]:
     for key, kinds in _SHAPE.items():
         if key not in data or not isinstance(data[key], kinds) or isinstance(data[key], bool):
             raise BadInput(f"{key} is missing or of the wrong type", where)
+    for key, kinds in _SHAPE.items():
+        if kinds in (_NUMBER, (float, int)) and not _finite(data[key]):
+            raise BadInput(f"{key} is out of range", where)
+    if data["tolerance"] < 0:
+        raise BadInput("tolerance is negative", where)
     if data["status"] not in EXIT:
         raise BadInput(f"{shown(data['status'])} is not a status", f"{where}.status")
     seconds = data["seconds"]
     fields = set(Seconds.__dataclass_fields__)
-    if set(seconds) != fields or not all(isinstance(v, _NUMBER) for v in seconds.values()):
+    if set(seconds) != fields or not all(_finite(v) for v in seconds.values()):
         raise BadInput("seconds needs compile, solve and verify", where)
     bracket = data["gamma_bar"]
     if bracket is not None and not (
-        len(bracket) == 2 and all(isinstance(x, float | int) or x == "inf" for x in bracket)
+        len(bracket) == 2 and all(x == "inf" or _finite(x) for x in bracket)
     ):
         raise BadInput("gamma_bar is null or [low, high]", where)
     if not all(isinstance(reason, str) for reason in data["reasons"]):
@@ -340,12 +358,14 @@ def read_arrays(
         with zipfile.ZipFile(path) as archive:
             for name, (shape, kind) in expected.items():
                 arrays[name] = _member(archive, name, shape, np.dtype(kind))
-    except (OSError, zipfile.BadZipFile, ValueError, EOFError, NotImplementedError) as error:
-        if isinstance(error, BadInput):
-            raise BadInput(error.message, f"{where}.{error.where}") from None
+    except BadInput as error:
+        raise BadInput(error.message, f"{where}.{error.where}") from None
+    except KeyError as error:
+        raise BadInput(f"array missing: {shown(str(error))}", where) from None
+    except Exception as error:  # decompressors and header parsers raise what they like
+        if isinstance(error, MemoryError):
+            raise
         raise BadInput(f"not a readable archive of arrays: {shown(str(error))}", where) from None
-    except (KeyError, RuntimeError, zipfile.LargeZipFile) as error:
-        raise BadInput(f"array missing or unreadable: {shown(str(error))}", where) from None
     return arrays
 
 

@@ -2,9 +2,10 @@
 
 All quantities are nonnegative, so a sum of L products has a relative rounding error of at most
 (L + 1) u, u = 2^-53, whatever its order; with gamma, the cost and the correction itself counted,
-(L + 8) u with a factor 1.1 to spare bounds everything (products that underflow add L * 2^-1074,
-covered by ``TINY``). A row that the fast bound leaves open is decided with exact rationals: the
-doubles G, gamma, V are read as they stand and a transition is numerator / total.
+(L + 8) u with a factor 1.1 to spare bounds everything. Products and shares below the normal range
+of doubles lose up to L * 2^-1074 times the largest factor, which is added apart. A row that the
+fast bound leaves open is decided with exact rationals: the doubles G, gamma, V are read as they
+stand and a transition is numerator / total.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 UNIT = 1.1 * 2.0**-53
-TINY = 1e-300
+LEAST = 2.0**-1074
 MAX_EXACT = 20_000
 """Rows decided with exact rationals before giving up: about 0.4 s."""
 
@@ -175,33 +176,41 @@ def _rounded_down(value: Fraction) -> float:
 
 @njit(cache=True, nogil=True)
 def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def]
-    """The sum (P V)_k, and whether any term is not zero."""
-    q, something = 0.0, False
+    """The sum (P V)_k, its relative and its absolute rounding error.
+
+    The absolute part covers shares and products below the normal range of doubles; it is 0 only
+    where every term is 0.
+    """
+    q, top = 0.0, 0.0
     for e in range(pointer[k], pointer[k + 1]):
         v = V[target[e]]
         if v != 0.0:
-            something = True
+            top = max(top, v)
             q += share[code[e]] * v
-    return q, something
+    entries = pointer[k + 1] - pointer[k]
+    absolute = entries * LEAST * (1.0 + top) if top > 0.0 else 0.0
+    return q, (entries + 8) * UNIT, absolute
 
 
 @njit(cache=True, nogil=True)
 def _bound_below(k, pointer, target, code, share, gamma, cost, V):  # type: ignore[no-untyped-def]
-    q, something = _product(k, pointer, target, code, share, V)
+    q, relative, absolute = _product(k, pointer, target, code, share, V)
     g = cost[k] if len(cost) else 0.0
-    if not something:
+    if absolute == 0.0:
         return g
-    slack = (pointer[k + 1] - pointer[k] + 8) * UNIT
-    return max((gamma * q + g) * (1.0 - slack) - TINY, g)
+    future = gamma * max(q * (1.0 - relative) - absolute, 0.0)
+    return max((future + g) * (1.0 - 4.0 * UNIT) - 2.0 * LEAST, g)
 
 
 @njit(cache=True, nogil=True)
 def _above(pair, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
     for i in range(len(pair)):
-        k = pair[i]
-        q, something = _product(k, pointer, target, code, share, V)
-        slack = (pointer[k + 1] - pointer[k] + 8) * UNIT
-        upper[i] = gamma * q * (1.0 + slack) + TINY if something else 0.0
+        q, relative, absolute = _product(pair[i], pointer, target, code, share, V)
+        if absolute == 0.0:
+            upper[i] = 0.0
+        else:
+            future = gamma * (q * (1.0 + relative) + absolute)
+            upper[i] = future * (1.0 + 4.0 * UNIT) + 2.0 * LEAST
 
 
 @njit(cache=True, nogil=True)

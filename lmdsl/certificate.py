@@ -146,7 +146,8 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
     with np.errstate(over="ignore", invalid="ignore"):
         inflow = lp.gamma * (P @ mu)
         entries = np.diff(P.indptr)
-        rounding = (entries + 8) * bounds.UNIT * (lp.weight + mu + inflow) + bounds.TINY
+        rounding = (entries + 8) * bounds.UNIT * (lp.weight + mu + inflow)
+        rounding += (1 + lp.gamma) * (entries + 8) * bounds.LEAST * (1 + mu.max(initial=0.0))
         residual = np.abs((lp.weight - mu) + inflow)
     if not np.isfinite(residual).all():
         return math.inf

@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         # The reader of our output went away: not an error of ours, and nobody to tell.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return int(getattr(parsed, "status", 0))
     except KeyboardInterrupt:
         return _fail("interrupted", 130)
     except MemoryError:
@@ -104,6 +104,8 @@ def _parser() -> argparse.ArgumentParser:
     solve.add_argument("--max-iterations", type=int, metavar="K", help="iterations of the backend")
     solve.add_argument("--require-all", action="store_true",
                        help="refuse a problem with a cell that cannot be stabilized")  # fmt: skip
+    solve.add_argument("--restrict-to-gamma", action="store_true",
+                       help="solve on the cells for which gamma is feasible")  # fmt: skip
     solve.add_argument("--out", metavar="DIR", help="write controller and certificate to DIR")
     as_json(solve)
 
@@ -130,9 +132,23 @@ def _parser() -> argparse.ArgumentParser:
     plot.add_argument("dir", metavar="DIR", help="result directory")
     plot.add_argument("--out", metavar="FILE", help="PNG, PDF or SVG (default DIR/figures.png)")
 
+    export = command("export", _export, "Write a saved result in a format for other readers.")
+    export.add_argument("dir", metavar="DIR", help="result directory")
+    export.add_argument("--format", required=True, choices=("certificate", "drn"),
+                        help="certificate: to be checked alone; drn: for Storm")  # fmt: skip
+    export.add_argument("--out", required=True, metavar="FILE", help="file to write")
+
     limit = command("gamma-max", _gamma_max, "Enclose the largest feasible gamma.")
     limit.add_argument("file", metavar="FILE", help="problem file")
     as_json(limit)
+
+    explain = command("explain", _explain, "Say which cells cannot be stabilized, why, and what "
+                      "would help.")  # fmt: skip
+    explain.add_argument("file", metavar="FILE", help="problem file")
+    explain.add_argument("--phase-one", action="store_true",
+                         help="phase-one LP: how much mass cannot be stabilized")  # fmt: skip
+    explain.add_argument("--time-limit", type=float, metavar="S", help="seconds for that LP")
+    as_json(explain)
 
     command("schema", _schema, "Print the JSON Schema of the problem file.")
     as_json(command("systems", _systems, "List the systems known by name."))
@@ -169,8 +185,10 @@ def _solve(parsed: Arguments) -> int:
             time_limit=parsed.time_limit,
             max_iterations=parsed.max_iterations,
             require_all=parsed.require_all,
+            restrict_to_gamma=parsed.restrict_to_gamma,
             progress=progress,
         )
+    parsed.status = result.exit_status
     if parsed.out is not None:
         result.save(parsed.out)
     if parsed.json:
@@ -195,6 +213,7 @@ def _compare(parsed: Arguments) -> int:
             time_limit=parsed.time_limit,
             progress=progress,
         )
+    parsed.status = comparison.exit_status
     if parsed.json:
         _print_json(comparison.to_dict())
     else:
@@ -207,6 +226,7 @@ def _verify(parsed: Arguments) -> int:
 
     with _Progress() as progress:
         found = verify(parsed.dir, parsed.exact, progress)
+    parsed.status = 0 if found.holds else 1
     if parsed.json:
         _print_json(found.to_dict())
     else:
@@ -252,6 +272,22 @@ def _plot(parsed: Arguments) -> int:
     return 0
 
 
+def _export(parsed: Arguments) -> int:
+    from lmdsl.exports import export_certificate, export_drn
+    from lmdsl.result import Result
+    from lmdsl.verification import recompiled
+
+    result = Result.load(parsed.dir)
+    with _Progress() as progress:
+        lp = recompiled(parsed.dir, result, progress)
+    if parsed.format == "drn":
+        export_drn(lp, parsed.out)
+    else:
+        export_certificate(result, parsed.out, lp)
+    print(f"written to {safe(parsed.out)}")
+    return 0
+
+
 def _gamma_max(parsed: Arguments) -> int:
     from lmdsl.gamma import gamma_max
     from lmdsl.lp import compile
@@ -271,6 +307,26 @@ def _gamma_max(parsed: Arguments) -> int:
         if found.note:
             print(f"  {found.note}")
     return 0 if found else 3
+
+
+def _explain(parsed: Arguments) -> int:
+    from lmdsl.explanation import explain
+    from lmdsl.problem import load
+
+    problem = load(parsed.file)
+    with _Progress() as progress:
+        found = explain(
+            problem,
+            phase_one=parsed.phase_one,
+            time_limit=parsed.time_limit,
+            progress=progress,
+        )
+        text = "" if parsed.json else found.text()
+    if parsed.json:
+        _print_json(found.to_dict())
+    else:
+        print("\n".join(safe(line) for line in text.splitlines()))
+    return 0
 
 
 def _schema(parsed: Arguments) -> int:
@@ -388,6 +444,7 @@ def _others(result: Any) -> str:
         CellStatus.TRAPPED: "trapped",
         CellStatus.LEADS_TO_THESE: "leading to these",
         CellStatus.AVOID: "avoid",
+        CellStatus.BEYOND_GAMMA: "beyond gamma",
     }
     parts = [
         f"{count} {text}"

@@ -49,8 +49,8 @@ class Controller:
         Returns
         -------
         ndarray, shape (..., p)
-            NaN where there is no control: off the stabilizable set, on the attractor cells, and
-            outside the box (with ``on_exit: clip``, a state outside is clipped into it first).
+            NaN where there is no control: off the stabilizable set, outside the box, and on the
+            attractor cells.
         """
         try:
             states = np.asarray(x, dtype=np.float64)
@@ -60,7 +60,7 @@ class Controller:
         if states.shape[-1:] != (d,):
             raise BadInput(f"states have shape (..., {d}), not {states.shape}")
         flat = states.reshape(-1, d)
-        cell = self.partition.locate(list(flat.T))
+        cell = self.partition.locate(list(flat.T), clip=False)
         return self.at(cell).reshape(*states.shape[:-1], self.vectors.shape[1])
 
     def at(self, cell: Indices) -> Floats:

@@ -6,7 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Discriminator,
+    Field,
+    Tag,
+    model_validator,
+)
 
 from lmdsl.declared import (
     Box,
@@ -25,6 +32,7 @@ from lmdsl.systems import NAMED, FunctionSystem, MapSystem, OdeSystem, System
 
 MAX_AXES = 16
 MAX_HERMITE = 64
+MAX_BOXES = 10_000
 
 Positive = Annotated[Number, Field(gt=0)]
 
@@ -213,10 +221,14 @@ Point = Annotated[
     BeforeValidator(plain),
     AfterValidator(lambda v: FrozenDict(v) if isinstance(v, dict) else v),
 ]
-Points = Annotated[tuple[Point, ...], BeforeValidator(plain)]
-Boxes = Annotated[tuple[Box, ...], BeforeValidator(plain)]
-CellIndex = Annotated[tuple[Annotated[int, Field(strict=True, ge=0)], ...], BeforeValidator(plain)]
-CellIndices = Annotated[tuple[CellIndex, ...], BeforeValidator(plain)]
+Points = Annotated[tuple[Point, ...], Field(fail_fast=True), BeforeValidator(plain)]
+Boxes = Annotated[
+    tuple[Box, ...], Field(max_length=MAX_BOXES, fail_fast=True), BeforeValidator(plain)
+]
+CellIndex = Annotated[
+    tuple[Annotated[int, Field(strict=True, ge=0, lt=2**31)], ...], BeforeValidator(plain)
+]
+CellIndices = Annotated[tuple[CellIndex, ...], Field(fail_fast=True), BeforeValidator(plain)]
 
 
 class Attractor(Declared):
@@ -250,9 +262,32 @@ class Avoid(Declared):
 
 
 class Measure(Declared):
-    """Support of the weight m: the cells inside the union of boxes, intersected with C."""
+    """The weight m of the starting cells, up to a factor; it is intersected with C and scaled.
 
-    boxes: Annotated[Boxes, Field(min_length=1)]
+    Attributes
+    ----------
+    boxes
+        Only the cells inside their union carry weight.
+    density
+        Formula in the states, evaluated at the centre of each cell; finite and >= 0. Default 1.
+    weights
+        One number >= 0 per cell, C order, instead of a density.
+    """
+
+    boxes: Annotated[Boxes, Field(min_length=1)] | None = None
+    density: str | None = None
+    weights: Annotated[Numbers, Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Measure:
+        if self.boxes is None and self.density is None and self.weights is None:
+            raise BadInput("give boxes, a density or weights")
+        if self.density is not None and self.weights is not None:
+            raise BadInput("density and weights exclude each other; keep one")
+        for i, weight in enumerate(self.weights or ()):
+            if weight < 0:
+                raise BadInput(f"{weight!r} is negative; weights are >= 0", f"weights[{i}]")
+        return self
 
 
 StateBox = Annotated[

@@ -76,19 +76,21 @@ def _named(value: dict[str, Any]) -> dict[str, Any]:
 Number = Annotated[float, BeforeValidator(plain), Field(allow_inf_nan=False, strict=True)]
 """A finite double; booleans, strings, NaN and infinities are refused."""
 
-Count = Annotated[int, BeforeValidator(plain), Field(strict=True, ge=1)]
+Count = Annotated[int, BeforeValidator(plain), Field(strict=True, ge=1, le=10**15)]
 """A whole number of at least 1."""
 
 Seed = Annotated[int, BeforeValidator(plain), Field(strict=True, ge=0, lt=2**63)]
 """A seed of a random generator."""
 
-Numbers = Annotated[tuple[Number, ...], BeforeValidator(plain)]
+Numbers = Annotated[tuple[Number, ...], Field(fail_fast=True), BeforeValidator(plain)]
 """A sequence of finite doubles."""
 
 frozen_dict = AfterValidator(FrozenDict)
 valid_names = AfterValidator(_named)
 
-Parameters = Annotated[dict[str, Number], BeforeValidator(plain), valid_names, frozen_dict]
+Parameters = Annotated[
+    dict[str, Number], Field(max_length=1000), BeforeValidator(plain), valid_names, frozen_dict
+]
 """Named constants of a system."""
 
 Formulas = Annotated[dict[str, str], BeforeValidator(plain), valid_names, frozen_dict]

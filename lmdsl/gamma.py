@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from lmdsl import bounds, linear, policy
 from lmdsl.errors import BadInput
+from lmdsl.graph import CellStatus
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.transitions import Progress
@@ -244,6 +245,38 @@ def _between(lp: StabilizationLP, best: GammaBar, high: float) -> GammaBar | Non
             if better is not None and better.low > best.low:
                 return better
     return None
+
+
+def restricted(lp: StabilizationLP, w: Floats) -> StabilizationLP | None:
+    """Leave out the cells a refusal proves infeasible, and the pairs that can lead to them.
+
+    With w the greatest solution of w = min(1, gamma min_a P_a w), every cell with w = 0 keeps a
+    pair whose successors all have w = 0: the smaller model is the part on which gamma is feasible.
+
+    Parameters
+    ----------
+    lp, w
+        The model and the vector of its refusal (claim 6), shape (n,).
+
+    Returns
+    -------
+    StabilizationLP or None
+        The model on the cells with w = 0; the others get the status BEYOND_GAMMA. None where no
+        cell is left, or one is left without a pair.
+    """
+    inside = np.flatnonzero(w == 0)
+    beyond = np.append(w > 0, False)
+    length = np.diff(lp.rows.pointer)
+    leads = np.add.reduceat(beyond[lp.rows.target].astype(np.int64), lp.rows.pointer[:-1]) > 0
+    columns = np.flatnonzero(~leads & (w[lp.cell] == 0) & (length > 0))
+    if not len(inside) or len(np.unique(lp.cell[columns])) < len(inside):
+        return None
+    smaller = lp.part(columns, inside)
+    status = lp.cell_status.copy()
+    status[lp.cells[w > 0]] = CellStatus.BEYOND_GAMMA
+    total = math.fsum(smaller.weight)
+    weight = smaller.weight / total if total > 0 else smaller.weight
+    return replace(smaller, cell_status=status, weight=weight)
 
 
 @njit(cache=True, nogil=True)

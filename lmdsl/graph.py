@@ -36,6 +36,7 @@ class CellStatus(IntEnum):
     TRAPPED = 3
     LEADS_TO_THESE = 4
     AVOID = 5
+    BEYOND_GAMMA = 6
 
 
 @dataclass(frozen=True)

@@ -42,6 +42,8 @@ def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
         A guess, shape (n,), >= 0.
     """
     x = np.array(b if start is None else start, dtype=np.float64)
+    if (b == 0).any():
+        x[~_pays(M, b)] = 0.0  # exactly: a guess would only fade there
     x, change, rate = _sweep(M, b, x, TRIAL_SWEEPS)
     if change <= TOLERANCE:
         return x
@@ -56,6 +58,15 @@ def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
         if not np.isfinite(change) or x.max() > CEILING:
             return None
     return None
+
+
+def _pays(M: Any, b: Floats) -> NDArray[np.bool_]:
+    """Return where x > 0: the cells from which some b > 0 can be reached."""
+    pays = b > 0
+    before = M.T.tocsr()
+    before.eliminate_zeros()
+    _spread(before.indptr, before.indices, pays)
+    return pays
 
 
 def _soon(change: float, rate: float) -> bool:
@@ -147,6 +158,24 @@ def _factors(inner: Any) -> Callable[[Floats], Floats]:
 def _dense(inner: Any) -> Callable[[Floats], Floats]:
     system = np.eye(inner.shape[0]) - inner.toarray()
     return lambda known: np.linalg.solve(system, known)
+
+
+@njit(cache=True, nogil=True)
+def _spread(indptr, indices, marked):  # type: ignore[no-untyped-def]
+    """Mark everything that can reach a marked node."""
+    queue = np.flatnonzero(marked)
+    queue = np.append(queue, np.empty(len(marked) - len(queue), dtype=queue.dtype))
+    end = marked.sum()
+    start = 0
+    while start < end:
+        j = queue[start]
+        start += 1
+        for e in range(indptr[j], indptr[j + 1]):
+            i = indices[e]
+            if not marked[i]:
+                marked[i] = True
+                queue[end] = i
+                end += 1
 
 
 @njit(cache=True, nogil=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -139,6 +139,31 @@ class StabilizationLP:
         k = first + int(np.searchsorted(self.control[first:last], control))
         return int(k) if k < last and self.control[k] == control else None
 
+    def part(self, columns: NDArray[np.int64], inside: NDArray[np.int64]) -> StabilizationLP:
+        """Return the model on some cells and columns; every successor must lie inside or in A.
+
+        Parameters
+        ----------
+        columns
+            Columns to keep, ascending.
+        inside
+            Positions of the cells to keep, ascending; each must keep a column.
+        """
+        renumber = np.full(self.n + 1, -1, dtype=np.int32)
+        renumber[inside] = np.arange(len(inside), dtype=np.int32)
+        renumber[self.n] = len(inside)
+        taken = self.rows.take(columns)
+        count = np.bincount(renumber[self.cell[columns]], minlength=len(inside))
+        return replace(
+            self,
+            cells=self.cells[inside],
+            pair_pointer=np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
+            control=self.control[columns],
+            rows=replace(taken, target=renumber[taken.target], columns=len(inside)),
+            cost=self.cost[columns],
+            weight=self.weight[inside],
+        )
+
     @cached_property
     def tree(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""
@@ -153,7 +178,7 @@ class StabilizationLP:
     def digest(self) -> str:
         """SHA-256 of the compiled model: statuses, pairs, exact transitions, costs, gamma, m."""
         sha = hashlib.sha256(b"lmdsl model 1\n")
-        sha.update(repr((self.rows.shares.total, self.rows.shares.numerator)).encode())
+        sha.update(repr((self.rows.shares.total, [*self.rows.shares.numerator])).encode())
         sha.update(np.array([self.gamma], dtype="<f8").tobytes())
         for array, kind in (
             (self.cell_status, "<u1"),
@@ -232,7 +257,6 @@ def compile(problem: Problem, progress: Progress | None = None) -> Stabilization
     status[regions.free] = graph.causes(found, transitions.pair_pointer)
     status[regions.attractor] = CellStatus.ATTRACTOR
     cells = regions.free[found.inside]
-    support = regions.support[cells]
     everything = len(kept) == len(transitions.control)
     return StabilizationLP(
         problem=problem,
@@ -245,5 +269,5 @@ def compile(problem: Problem, progress: Progress | None = None) -> Stabilization
         rows=rows,
         cost=transitions.cost if everything else transitions.cost[kept],
         gamma=problem.gamma,
-        weight=support / max(int(support.sum()), 1),
+        weight=regions.weight(cells),
     )

@@ -159,7 +159,7 @@ class Partition:
         """Return the block of closed cells within 1e-9 widths of a point."""
         block = []
         for k, x in enumerate(point):
-            t = (x - self.low[k]) / self.width[k]
+            t = _units(x, self.low[k], self.width[k])
             n = int(self.cells[k])
             if self.periodic[k]:
                 if not abs(t) < 2**52:
@@ -210,7 +210,7 @@ class Partition:
                 block.append(np.arange(n))
                 continue
             a, b = box[name]
-            ta, tb = ((end - self.low[k]) / self.width[k] for end in (a, b))
+            ta, tb = (_units(end, self.low[k], self.width[k]) for end in (a, b))
             if self.periodic[k] and not (ta >= -EDGE and tb <= n + EDGE):
                 raise BadInput(
                     f"[{a!r}, {b!r}] leaves the periodic axis [{float(self.low[k])!r}, "
@@ -220,6 +220,12 @@ class Partition:
             first, last = cells(*(min(max(float(t), -2.0), n + 2.0) for t in (ta, tb)))
             block.append(np.arange(max(int(first), 0), min(int(last), n - 1) + 1))
         return tuple(block)
+
+
+def _units(x: float, low: float, width: float) -> float:
+    """Return (x - low) / width; infinite where it overflows."""
+    with np.errstate(over="ignore"):
+        return float((x - low) / width)
 
 
 _IMAGE = types.Array(types.float64, 4, "A", readonly=True)
@@ -263,7 +269,7 @@ def _locate(flat, image, low, high, width, cells, periodic, clip):  # type: igno
                                 flat[c, a, p, q] = -1
                                 continue
                             k = k % n
-                    elif k == n and t - n <= EDGE:
+                    elif k >= n and (t - n <= EDGE or (clip and x == high)):
                         k = n - 1.0
                     elif not (0.0 <= k < n):
                         flat[c, a, p, q] = -1

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from lmdsl.explanation import Explanation
     from lmdsl.result import Result
 
 FORMATS = ("png", "pdf", "svg")
@@ -147,6 +148,41 @@ def cost(
     if np.isfinite(value).any():
         layers.scalar(drawn, view, value, "cost-to-go V", "viridis")
     layers.regions(drawn, view, view.slice(_codes(result)), legend)
+    return drawn
+
+
+def causes(
+    explanation: Explanation,
+    ax: Axes | None = None,
+    *,
+    axes: Sequence[str] | None = None,
+    at: At | None = None,
+    legend: bool = True,
+) -> Axes:
+    """Draw by cause the cells that cannot be stabilized, and outline the listed regions.
+
+    Parameters
+    ----------
+    explanation
+        What :func:`lmdsl.explain` returns.
+    ax
+        Axes to draw into; new ones if None.
+    axes, at
+        Which axes are shown and where the others are held.
+    legend
+        Explain the regions below the axes.
+
+    Returns
+    -------
+    matplotlib.axes.Axes
+    """
+    status = explanation.cell_status
+    view = View.of(explanation.partition, status == CellStatus.ATTRACTOR, axes, at)
+    drawn: Axes = layers.frame(ax, view, "cells that cannot be stabilized" + view.note)
+    code = np.where(status == CellStatus.STABILIZED, np.uint8(layers.UNSOLVED), status)
+    layers.regions(drawn, view, view.slice(code), legend)
+    boxes = [region.box for cause in explanation.causes for region in cause.regions]
+    layers.frames(drawn, view, boxes)
     return drawn
 
 

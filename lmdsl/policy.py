@@ -90,22 +90,34 @@ def iterate(
     cost: Floats | None = None,
     allowed: Bools | None = None,
     stop: Stop = lambda: False,
-    limit: int = 1000,
+    limit: int | None = None,
 ) -> Iteration:
-    """Howard's policy iteration from a policy and its value."""
-    for step in range(limit):
-        if stop():
+    """Howard's policy iteration from a policy and its value.
+
+    The k-th step makes k improvement sweeps before it evaluates, so that news from A travels
+    further than one cell a step. Each sweep lowers V where a control is strictly better and keeps
+    that control: T_u V <= V stays true, with equality on no recurrent class that was changed.
+    """
+    step = 0
+    while True:
+        if stop() or step == limit:
             return Iteration(pair, value, step, False)
-        better = bellman.improve(lp, value, gamma, cost, allowed)
-        change = better.value < value - TIE * np.abs(value)
-        if not change.any():
+        new, lowered = pair, value
+        for _ in range(step + 1):
+            better = bellman.improve(lp, lowered, gamma, cost, allowed)
+            change = (better.value < lowered - TIE * np.abs(lowered)) & (better.pair != new)
+            if not change.any():
+                break
+            new = np.where(change, better.pair, new)
+            lowered = np.where(change, better.value, lowered)
+        if new is pair:
             return Iteration(pair, value, step, True)
-        new = np.where(change, better.pair, pair)
-        new_value = evaluate(lp, new, gamma, cost, value)
-        if new_value is None:  # rounding made a change look better than it is
+        new_value = evaluate(lp, new, gamma, cost, lowered)
+        if new_value is None or not (new_value < value).any():
+            # Rounding made a change look better than it is.
             return Iteration(pair, value, step, True)
         pair, value = new, new_value
-    return Iteration(pair, value, limit, False)
+        step += 1
 
 
 def canonical(lp: StabilizationLP, pair: Pairs, value: Floats) -> Pairs:
@@ -132,7 +144,7 @@ def canonical(lp: StabilizationLP, pair: Pairs, value: Floats) -> Pairs:
         return first
     columns = np.flatnonzero(ties)[found.surviving]
     inside = np.flatnonzero(found.inside)
-    sub = _sub_lp(lp, columns, inside)
+    sub = lp.part(columns, inside)
     unit = np.ones(sub.K)
     start = np.searchsorted(columns, pair[inside])
     start = np.minimum(start, len(columns) - 1)
@@ -163,25 +175,6 @@ def _columns(lp: StabilizationLP, allowed: Bools):  # type: ignore[no-untyped-de
     count = np.add.reduceat(allowed, lp.pair_pointer[:-1], dtype=np.int64)
     pointer = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
     return pointer, lp.rows.take(np.flatnonzero(allowed))
-
-
-def _sub_lp(lp: StabilizationLP, columns: Pairs, inside: Pairs) -> StabilizationLP:
-    """Return the model on some cells and columns; every successor must lie inside or in A."""
-    renumber = np.full(lp.n + 1, -1, dtype=np.int32)
-    renumber[inside] = np.arange(len(inside), dtype=np.int32)
-    renumber[lp.n] = len(inside)
-    taken = lp.rows.take(columns)
-    rows = replace(taken, target=renumber[taken.target], columns=len(inside))
-    count = np.bincount(renumber[lp.cell[columns]], minlength=len(inside))
-    return replace(
-        lp,
-        cells=lp.cells[inside],
-        pair_pointer=np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
-        control=lp.control[columns],
-        rows=rows,
-        cost=lp.cost[columns],
-        weight=lp.weight[inside],
-    )
 
 
 def stability_vector(
@@ -237,15 +230,17 @@ class Undecided:
 def stabilizing(lp: StabilizationLP, stop: Stop = lambda: False) -> Feasible | Refused | Undecided:
     """Find a policy that is stabilizing with weight g = max(gamma, 1), or a proof against it.
 
-    Algorithm 1 gives the first policy. For gamma > 1, gamma is raised from 1 in steps, each below
-    the limit of the last policy, under unit cost (under a cost with zeros this can stall).
+    Algorithm 1 gives the first policy. Where it does not do, gamma is raised from 1/2 in steps,
+    each below the limit of the last policy, under unit cost (under a cost with zeros this can
+    stall).
     """
     g, unit = lp.growth, np.ones(lp.K)
     pair = lp.tree[1]
     w, _ = stability_vector(lp, pair)
     if w is not None:
         return Feasible(pair, w)
-    at, value = 1.0, evaluate(lp, pair, 1.0, unit)
+    # The tree can be exponentially slow; at gamma = 1/2 every policy has a value, at most 2.
+    at, value = 0.5, evaluate(lp, pair, 0.5, unit)
     if value is None:
         return Undecided(pair, 0.0)
     refuse_at = 0
@@ -257,8 +252,8 @@ def stabilizing(lp: StabilizationLP, stop: Stop = lambda: False) -> Feasible | R
             return Feasible(pair, w)
         if stop():
             break
-        if step == refuse_at:
-            refuse_at = 2 * refuse_at + 4
+        if g > 1 and at >= 1 and step >= refuse_at:
+            refuse_at = 2 * step + 4
             proof = refusal(lp, stop)
             if proof is not None:
                 return Refused(proof, pair, at)

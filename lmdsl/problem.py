@@ -107,6 +107,7 @@ class Problem(Declared):
         self._axes_named()
         self.step()
         self.cost()
+        self.density()
         return self
 
     @property
@@ -131,11 +132,20 @@ class Problem(Declared):
 
     def cost(self) -> Formula:
         """Return the parsed stage cost."""
-        names = [*self.states, *self.controls, *self.noises, *self.system.constants()]
+        names = {*self.states, *self.controls, *self.noises, *self.system.constants()}
         try:
             return parse(self.stage_cost, names)
         except BadInput as error:
             raise BadInput(error.message, "stage_cost") from None
+
+    def density(self) -> Formula | None:
+        """Return the parsed density of the measure, None where there is none."""
+        if self.measure is None or self.measure.density is None:
+            return None
+        try:
+            return parse(self.measure.density, {*self.states, *self.system.constants()})
+        except BadInput as error:
+            raise BadInput(error.message, "measure.density") from None
 
     def _unique_names(self) -> None:
         kinds = {
@@ -170,7 +180,7 @@ class Problem(Declared):
                 )
         for where in ("attractor", "avoid", "measure"):
             part = getattr(self, where)
-            for i, box in enumerate(part.boxes if part else ()):
+            for i, box in enumerate((part.boxes or ()) if part else ()):
                 self._box_named(box, f"{where}.boxes[{i}]")
 
     def _box_named(self, box: Mapping[str, tuple[float, float]], where: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from lmdsl.errors import BadInput
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
+from lmdsl.program import Program
 
 
 @dataclass(frozen=True)
@@ -20,8 +22,8 @@ class Regions:
     ----------
     attractor, avoid
         Masks of shape (N,).
-    support
-        Cells in which m may be positive, shape (N,).
+    mass
+        Weight of every cell before it is intersected with C and scaled, shape (N,).
     free
         Indices of the cells outside A and Z, shape (F,), ascending.
     number
@@ -30,9 +32,15 @@ class Regions:
 
     attractor: NDArray[np.bool_]
     avoid: NDArray[np.bool_]
-    support: NDArray[np.bool_]
+    mass: NDArray[np.float64]
     free: NDArray[np.int64]
     number: NDArray[np.int32]
+
+    def weight(self, cells: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return m on the cells of C: their mass scaled to sum 1, all zero where they have none."""
+        mass = self.mass[cells]
+        total = math.fsum(mass)
+        return mass / total if total > 0 else np.zeros(len(cells))
 
     @classmethod
     def of(cls, problem: Problem, partition: Partition) -> Regions:
@@ -55,19 +63,50 @@ class Regions:
         if len(both):
             index = [int(k) for k in np.unravel_index(both[0], partition.shape)]
             raise BadInput(f"cell {index} is both attractor and avoid; shrink one of them", "avoid")
-        support = np.ones(partition.size, dtype=np.bool_)
-        if problem.measure:
-            support = partition.mask(
-                partition.inside_box(box, f"measure.boxes[{i}]")
-                for i, box in enumerate(problem.measure.boxes)
-            )
-            if not support.any():
-                raise BadInput("no cell lies inside the boxes; enlarge them", "measure.boxes")
+        mass = _mass(problem, partition)
         free = np.flatnonzero(~attractor & ~avoid)
         number = np.full(partition.size, -1, dtype=np.int32)
         number[free] = np.arange(len(free), dtype=np.int32)
         number[attractor] = len(free)
-        return cls(attractor, avoid, support, free, number)
+        return cls(attractor, avoid, mass, free, number)
+
+
+def _mass(problem: Problem, partition: Partition) -> NDArray[np.float64]:
+    mass = np.ones(partition.size)
+    measure = problem.measure
+    if measure is None:
+        return mass
+    density = problem.density()
+    if measure.weights is not None:
+        if len(measure.weights) != partition.size:
+            raise BadInput(
+                f"{len(measure.weights)} weights for {partition.size} cells; give one each",
+                "measure.weights",
+            )
+        mass = np.array(measure.weights)
+    elif density is not None:
+        centres = partition.centres(np.arange(partition.size))
+        program = Program([density], problem.system.constants())
+        values = program(dict(zip(partition.names, centres.T, strict=True)))[0]
+        mass = np.array(np.broadcast_to(values, partition.size))
+        bad = np.flatnonzero(~((mass >= 0) & np.isfinite(mass)))
+        if len(bad):
+            index = [int(k) for k in np.unravel_index(bad[0], partition.shape)]
+            raise BadInput(
+                f"the density is {float(mass[bad[0]])!r} in cell {index}; it must be finite "
+                "and >= 0",
+                "measure.density",
+            )
+    if measure.boxes is not None:
+        inside = partition.mask(
+            partition.inside_box(box, f"measure.boxes[{i}]") for i, box in enumerate(measure.boxes)
+        )
+        if not inside.any():
+            raise BadInput("no cell lies inside the boxes; enlarge them", "measure.boxes")
+        mass[~inside] = 0.0
+    if not mass.any():
+        raise BadInput("no cell carries weight; widen the boxes or the density", "measure")
+    return mass
 
 
 def _attractor(problem: Problem, partition: Partition) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -114,6 +115,23 @@ def jsonable(value: Any) -> Any:
     return value
 
 
+@dataclass(frozen=True)
+class CostFrom:
+    """The conditional cost of a starting region.
+
+    Attributes
+    ----------
+    upper, lower
+        The policy's cost is at most ``upper``; no policy costs less than ``lower``.
+    mass
+        Share m(B) of the weight that starts there.
+    """
+
+    upper: float
+    lower: float
+    mass: float
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Result(Report):
     """The answer to a problem; see :class:`Report` for the scalars.
@@ -183,10 +201,43 @@ class Result(Report):
     @cached_property
     def weight(self) -> Floats:
         """The user's m over all cells, shape (N,), sum 1 (all zero where none lies in C)."""
-        support = Regions.of(self.problem, self.partition).support
-        mass = support & (self.cell_status == CellStatus.STABILIZED)
-        weight: Floats = mass / max(int(mass.sum()), 1)
+        weight = np.zeros(self.partition.size)
+        on = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
+        weight[on] = Regions.of(self.problem, self.partition).weight(on)
         return weight
+
+    def cost_from(self, *boxes: Mapping[str, tuple[float, float]]) -> CostFrom:
+        """Return the conditional cost of starting in a region: sum over B of m V / m(B).
+
+        Parameters
+        ----------
+        boxes
+            Axis name to ``(a, b)``; the region is the cells of C inside their union.
+
+        Returns
+        -------
+        CostFrom
+            Proved bounds, and the share m(B) of the weight.
+
+        Raises
+        ------
+        BadInput
+            No cell of the region carries weight.
+        """
+        blocks = []
+        for i, box in enumerate(boxes):
+            for name in box:
+                if name not in self.partition.names:
+                    raise BadInput(f"{shown(name)} is not an axis", f"boxes[{i}]")
+            blocks.append(self.partition.inside_box(box, f"boxes[{i}]"))
+        weight = np.where(self.partition.mask(blocks), self.weight, 0.0)
+        on = weight > 0
+        if not on.any():
+            raise BadInput("no cell of C inside the boxes carries weight; enlarge them", "boxes")
+        mass = math.fsum(weight)
+        with np.errstate(invalid="ignore"):
+            upper, lower = (math.fsum(weight[on] * x[on]) / mass for x in (self.value, self.lower))
+        return CostFrom(upper * (1 + 1e-15), lower * (1 - 1e-15), mass)
 
     def simulate(self, starts: int = 10_000, steps: int = 10_000, seed: int = 0) -> Simulation:
         """Run the true map under the controller from fresh random starts drawn by m.

@@ -11,6 +11,7 @@ entry, 0 there. Every row sums to exactly 1 with it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -36,7 +37,7 @@ class Shares:
         The same as doubles, shape (codes,), each correctly rounded.
     """
 
-    numerator: tuple[int, ...]
+    numerator: Sequence[int]
     total: int
     value: NDArray[np.float64]
 
@@ -46,6 +47,9 @@ class Shares:
     @classmethod
     def of(cls, points: int, nodes: Nodes) -> Shares:
         """Return the codes of ``points`` sample points times noise nodes."""
+        if len(nodes.weights) == 1:
+            codes = points
+            return cls(range(1, codes + 1), codes, np.arange(1, codes + 1) / codes)
         exact: list[Fraction] = []
         sizes = np.bincount(nodes.group)
         for weight, size in zip(nodes.group_weights(), sizes, strict=True):

@@ -33,6 +33,7 @@ def solve(
     time_limit: float | None = None,
     max_iterations: int | None = None,
     require_all: bool = False,
+    restrict_to_gamma: bool = False,
     progress: Progress | None = None,
 ) -> Result:
     """Solve a problem and verify the answer.
@@ -52,6 +53,9 @@ def solve(
         Iterations in the backend's own sense.
     require_all
         Refuse a problem of which a cell outside A and Z is not stabilizable.
+    restrict_to_gamma
+        Where gamma is infeasible for some cells, solve on the others: the cells left out get the
+        status BEYOND_GAMMA, and ``witness`` proves that no policy has finite cost from them.
     progress
         Called with (stage, fraction done, or -1).
 
@@ -85,6 +89,19 @@ def solve(
         verified = _refuse(lp, first, tolerance)
         w = verified.witness.w
         if verified.certificate.refusal and w is not None:
+            smaller = gamma.restricted(lp, w) if restrict_to_gamma else None
+            if smaller is not None:
+                inner = solve(
+                    smaller,
+                    backend,
+                    tolerance=tolerance,
+                    time_limit=time_limit,
+                    max_iterations=max_iterations,
+                    require_all=require_all,
+                    restrict_to_gamma=True,
+                    progress=progress,
+                )
+                return job.restricted(inner, lp.expand(w, 0.0, 0.0))
             job.solve_seconds = time.perf_counter() - started
             limits = gamma.bracket(lp, late)
             bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
@@ -283,6 +300,16 @@ class _Job:
         proof = replace(verified.certificate, reasons=(message,))
         return self._result(
             verified.witness, proof, "not_stabilizable", message, cause=cause, gamma_bar=gamma_bar
+        )
+
+    def restricted(self, inner: Result, w: NDArray[np.float64]) -> Result:
+        """Add to the result on the feasible cells the proof that the others are infeasible."""
+        count = int((w > 0).sum())
+        return replace(
+            inner,
+            witness=inner.witness + w,
+            seconds=replace(inner.seconds, compile=self.compile_seconds),
+            message=f"{inner.message}; {count} cells are proved infeasible at this gamma",
         )
 
     def solved(

@@ -12,6 +12,7 @@ beyond the result is bounded.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -129,11 +130,10 @@ def _four(array: Floats) -> Floats:
 
 def estimate(problem: Problem, entries: float = 1.0) -> int:
     """Return the bytes needed to compile a problem, given the mean entries per row."""
-    N = 1
-    for axis in problem.state_box.values():
-        N *= axis.cells
-    M = sampling.control_count(problem)
-    S = sampling.sample_points(problem) * sampling.node_count(problem)
+    # Capped: a stranger's product of counts may exceed the range of doubles.
+    N = min(math.prod(axis.cells for axis in problem.state_box.values()), 10**40)
+    M = min(sampling.control_count(problem), 10**40)
+    S = min(sampling.sample_points(problem) * sampling.node_count(problem), 10**40)
     code = 1 if S <= 2**8 else 2 if S <= 2**16 else 4
     pairs = N * M
     rows = pairs * (20 + entries * (4 + code) * 1.25)
@@ -239,7 +239,10 @@ def _refuse_cost(
     cell, control = int(cells[i]), int(controls.start) + a
     values = sampler.values(np.array([cell]), slice(control, control + 1))
     sample = np.asarray(sampler.cost(values)[0])
-    worst = float(sample[~((sample >= 0) & np.isfinite(sample))].ravel()[0])
+    faulty = sample[~((sample >= 0) & np.isfinite(sample))].ravel()
+    if not len(faulty):
+        raise BadInput("the mean of the samples overflows; scale the cost down", "stage_cost")
+    worst = float(faulty[0])
     index = [int(k) for k in np.unravel_index(cell, sampler.partition.shape)]
     vector = [float(u) for u in sampler.controls[control]]
     raise BadInput(

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl import archive
+from lmdsl import archive, memory
 from lmdsl.certificate import CLAIMS, Certificate, Witness, check
 from lmdsl.errors import BadInput
 from lmdsl.exact import check_exactly
+from lmdsl.gamma import restricted
 from lmdsl.graph import CellStatus
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.regions import Regions
@@ -26,7 +27,7 @@ from lmdsl.result import Result, jsonable
 from lmdsl.rows import Rows, Shares
 from lmdsl.sampling import noise_nodes, sample_points
 from lmdsl.systems import FunctionSystem
-from lmdsl.transitions import Progress
+from lmdsl.transitions import Progress, estimate
 
 Judge = Callable[[StabilizationLP, Witness, float], Certificate]
 LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
@@ -99,16 +100,15 @@ def verify(
     judge = check_exactly if exact else check
     result = archive.load(path)
     notes: list[str] = []
+    lp = recompiled(path, result, progress)
     if isinstance(result.problem.system, FunctionSystem):
-        lp = _stored_model(Path(path), result)
         notes.append("the system is a Python function, which was not re-evaluated: its saved rows")
         notes[-1] += " were checked"
-    else:
-        lp = compile(result.problem, progress)
+    reasons: list[str] = []
+    lp = _restricted(lp, result, reasons, judge)
     same = lp.digest == result.model_sha256
     if not same:
         notes.append("the recompiled model differs from the stored one; claims are judged on it")
-    reasons: list[str] = []
     if not np.array_equal(lp.cell_status, result.cell_status):
         reasons.append("cell_status differs from the recompiled model")
     for name, count in (
@@ -127,6 +127,28 @@ def verify(
         if result.status != "verified":
             reasons.append(f"the status is {result.status}, not verified")
     return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
+
+
+def _restricted(
+    lp: StabilizationLP, result: Result, reasons: list[str], judge: Judge
+) -> StabilizationLP:
+    """Return the part of the model a restricted result speaks of, its refusal checked."""
+    beyond = result.cell_status[lp.cells] == CellStatus.BEYOND_GAMMA
+    if not beyond.any():
+        return lp
+    w = np.where(beyond, result.witness[lp.cells], 0.0)
+    if not (w[beyond] > 0).all() or not judge(lp, Witness(None, w), 0.0).refusal:
+        reasons.append("that gamma is infeasible from the cells left out is not proved")
+    return restricted(lp, w) or lp
+
+
+def recompiled(
+    path: str | os.PathLike[str], result: Result, progress: Progress | None = None
+) -> StabilizationLP:
+    """Return the finite model of a directory made anew; of a Python function, its saved rows."""
+    if isinstance(result.problem.system, FunctionSystem):
+        return _stored_model(Path(path), result)
+    return compile(result.problem, progress)
 
 
 def _judge_claims(
@@ -207,6 +229,7 @@ def _stored_model(folder: Path, result: Result) -> StabilizationLP:
     regions = Regions.of(problem, result.partition)
     cells = np.flatnonzero(status == CellStatus.STABILIZED)
     n, K = len(cells), int(result.pairs or 0)
+    memory.require(estimate(problem), "the saved rows")
     nodes, points = noise_nodes(problem), sample_points(problem)
     path = folder / "model.npz"
     small = archive.read_arrays(
@@ -231,11 +254,10 @@ def _stored_model(folder: Path, result: Result) -> StabilizationLP:
         n,
     )
     _refuse_broken(rows, small, len(result.control_vectors))
-    support = regions.support[cells]
     return StabilizationLP(
         problem, result.partition, result.control_vectors, status, cells,
         small["pair_pointer"], small["control"], rows, small["cost"], problem.gamma,
-        support / max(int(support.sum()), 1),
+        regions.weight(cells),
     )  # fmt: skip
 
 

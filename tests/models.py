@@ -108,6 +108,31 @@ def _only(lp, found) -> lm.StabilizationLP:
     return build(pair_pointer, lp.control[kept], rows, lp.cost[kept], lp.gamma)
 
 
+def mdp(cells, samples: int, gamma: float) -> lm.StabilizationLP:
+    """Return a model written out: per cell a list of ({successor: count}, cost), -1 is A."""
+    n = len(cells)
+    shares = Shares.of(samples, Nodes(np.zeros((1, 0)), np.ones(1), np.zeros(1, dtype=np.int64)))
+    rows = [
+        {(n if j == -1 else j): c for j, c in row.items()}
+        for choices in cells
+        for row, _ in choices
+    ]
+    assert all(sum(row.values()) == samples for row in rows)
+    pointer = np.cumsum([0] + [len(row) for row in rows]).astype(np.int64)
+    compact = Rows(
+        pointer,
+        np.array([j for row in rows for j in row], dtype=np.int32),
+        np.array([c - 1 for row in rows for c in row.values()], dtype=np.uint8),
+        shares,
+        n,
+    )
+    counts = [len(choices) for choices in cells]
+    pair_pointer = np.cumsum([0, *counts]).astype(np.int64)
+    control = np.concatenate([np.arange(k) for k in counts]).astype(np.int32)
+    cost = np.array([g for choices in cells for _, g in choices])
+    return build(pair_pointer, control, compact, cost, gamma)
+
+
 def dense(lp: lm.StabilizationLP) -> np.ndarray:
     """Return P as a dense array, made from the exact rows."""
     P = np.zeros((lp.K, lp.n + 1))

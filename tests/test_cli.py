@@ -288,6 +288,16 @@ def test_unreadable_results(capsys, file, tmp_path):
         "bomb": lambda f: archive_with(f, "value", header("<f8", (4,)) + bytes(50_000_000)),
         "pickle": lambda f: archive_with(f, "value", header("|O", (4,)) + b"x" * 32),
         "short": lambda f: archive_with(f, "value", header("<f8", (4,)) + bytes(8)),
+        "bad deflate": lambda f: (f / "solution.npz").write_bytes(
+            (f / "solution.npz").read_bytes()[:200] + bytes(400)
+        ),
+        "header": lambda f: archive_with(
+            f, "value", bytes([147]) + b"NUMPY" + bytes([1, 0, 16, 0]) + b"{'descr': (" + b"'" * 3
+        ),
+        "huge cost": lambda f: spoil_certificate(f, cost=10**310),
+        "huge tolerance": lambda f: spoil_certificate(f, tolerance=10**310),
+        "negative tolerance": lambda f: spoil_certificate(f, tolerance=-1.0),
+        "huge bracket": lambda f: spoil_certificate(f, gamma_bar=[1.0, 10**310]),
         "control index": lambda f: spoil_array(f, "control_index", lambda a: a.fill(9)),
         "certificate gone": lambda f: (f / "certificate.json").unlink(),
         "certificate list": lambda f: (f / "certificate.json").write_text("[]"),

@@ -47,10 +47,20 @@ controller
 result
 archive
 stabilize
+boxes
+facts
+phase_one hints
+explanation
 comparison verification
+exports.*
+exports
 drawing drawing.view
 drawing.*
 plotting
+testing.known testing.report
+testing.probe
+testing.checks
+testing
 cli
 __main__
 """
@@ -58,8 +68,8 @@ __main__
 PUBLIC = [
     "BadInput", "CellStatus", "Certificate", "Comparison", "Controller", "GammaBar",
     "LmdslError", "Problem", "Result", "Simulation", "StabilizationLP", "Verification",
-    "__version__", "backends", "compare", "compile", "gamma_max", "load", "plotting", "solve",
-    "systems", "verify",
+    "__version__", "backends", "compare", "compile", "explain", "exports", "gamma_max", "load",
+    "plotting", "solve", "systems", "testing", "verify",
 ]  # fmt: skip
 
 # Imports inside functions against the order, each with its reason.
@@ -164,6 +174,13 @@ def test_public_parameters_are_documented(name, item):
         return
     for parameter in inspect.signature(item).parameters:
         assert parameter in text, f"{name} does not document {parameter}"
+
+
+def test_the_checker_of_certificates_stands_alone():
+    script = PACKAGE.parent / "tools/check_certificate.py"
+    assert len(script.read_text().splitlines()) < 200
+    for imported in imports(script):
+        assert imported.split(".")[0] in sys.stdlib_module_names
 
 
 def test_no_file_is_too_long():

@@ -40,6 +40,7 @@ from lmdsl import archive, backends, cli, plotting, problem
 from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
 from lmdsl.result import EXIT, Report
 from lmdsl.systems import NAMED
+from lmdsl.testing.checks import CHECKS
 
 mpl.use("Agg")
 
@@ -340,10 +341,11 @@ def members(item: type) -> set[str]:
 def test_every_public_name_is_described():
     text = doc("python.md")
     assert not missing(lm.__all__, text)
-    for module in (lm.systems, lm.backends):
+    for module in (lm.systems, lm.backends, lm.testing):
         assert not missing(module.__all__, text)
     for record in (lm.StabilizationLP, lm.Certificate, lm.Controller, lm.Simulation,
-                   lm.Comparison, lm.Verification, lm.GammaBar, lm.Result):  # fmt: skip
+                   lm.Comparison, lm.Verification, lm.GammaBar, lm.Result, lm.testing.Check,
+                   lm.testing.Report):  # fmt: skip
         described = text + doc("command-line.md")
         assert not missing(members(record), described), record.__name__
     own = {name for name in vars(lm.Problem) if not name.startswith("_")}
@@ -351,16 +353,26 @@ def test_every_public_name_is_described():
     assert not missing({name for name in own if callable(getattr(lm.Problem, name, None))}, text)
 
 
-@pytest.mark.parametrize("name", ["solve", "compare", "compile", "gamma_max", "load", "verify"])
+@pytest.mark.parametrize(
+    "name", ["solve", "compare", "compile", "explain", "gamma_max", "load", "verify"]
+)
 def test_signatures_are_as_described(name):
     check_signature(f"lm.{name}", getattr(lm, name))
 
 
 @pytest.mark.parametrize(
-    "name", ["portrait", "cost", "control", "measure", "trajectories", "figure"]
+    "name", ["portrait", "cost", "causes", "control", "measure", "trajectories", "figure"]
 )
 def test_signatures_of_plots_are_as_described(name):
     check_signature(name, getattr(plotting, name))
+
+
+def test_the_signature_of_the_contract_suite_is_as_described():
+    check_signature("check_backend", lm.testing.check_backend)
+
+
+def test_every_check_of_the_contract_is_described():
+    assert not missing(CHECKS, section(doc("backends.md"), "### Checking it"))
 
 
 def check_signature(name: str, function) -> None:

@@ -151,3 +151,52 @@ def test_command_line(tmp_path, capsys):
     file.write_text(json.dumps(steps(avoid={"boxes": [{"x": [0.25, 0.5]}]})))
     assert main(["gamma-max", str(file), "--json"]) == 3
     assert json.loads(capsys.readouterr().out) == {"gamma_bar": None}
+
+
+def corner(gamma_value: float) -> dict:
+    """Six cells: 1 and 2 reach A = cell 0 surely; 3 escapes itself with probability 1/2 a step.
+
+    4 chooses between going through 3 and going to 2 for a higher price; 5 must go through 3.
+    gamma_bar = 2, and only 3 and 5 limit it.
+    """
+    half = "where(w > 0, x, x - 1)"
+    formula = f"where(x < 3, x - 1, where(x < 4, {half}, where(x < 5, x - 1 - u, x - 2)))"
+    return {
+        "format": "lmdsl/1",
+        "system": {"kind": "map", "next": {"x": formula}},
+        "state_box": {"x": {"low": 0, "high": 6, "cells": 6}},
+        "attractor": {"cells": [[0]]},
+        "control_grid": {"u": {"values": [0, 1]}},
+        "noise": {"w": {"values": [-1, 1], "weights": [0.5, 0.5]}},
+        "stage_cost": "1 + u",
+        "sampling": {"kind": "grid", "per_axis": 1},
+        "gamma": gamma_value,
+    }
+
+
+def test_one_hard_corner_can_be_left_out(tmp_path):
+    problem = made(corner(2.5))
+    assert lm.solve(problem).status == "not_stabilizable"
+    result = lm.solve(problem, restrict_to_gamma=True)
+    assert result.status == "verified", result.message
+    assert result.cell_status.tolist() == [0, 1, 1, 6, 1, 6]
+    g = 2.5
+    np.testing.assert_allclose(result.value[[1, 2, 4]], [1, 1 + g, 2 + g * (1 + g)])
+    assert result.control_index.tolist()[4] == 1
+    assert np.isinf(result.value[[3, 5]]).all()
+    assert (result.witness[[3, 5]] > 0).all()
+    result.save(tmp_path / "out")
+    assert lm.verify(tmp_path / "out").holds
+    assert lm.verify(tmp_path / "out", exact=True).holds
+    # Negative control: a cell wrongly left out is not proved infeasible.
+    with np.load(tmp_path / "out" / "solution.npz") as stored:
+        arrays = dict(stored)
+    arrays["cell_status"][4] = 6
+    np.savez(tmp_path / "out" / "solution.npz", **arrays)
+    assert not lm.verify(tmp_path / "out").holds
+    feasible = lm.solve(made(corner(1.5)), restrict_to_gamma=True)
+    assert feasible.cell_status.tolist() == [0, 1, 1, 1, 1, 1]
+
+
+def test_restriction_leaves_nothing():
+    assert lm.solve(made(doubling(3)), restrict_to_gamma=True).status == "not_stabilizable"

@@ -206,6 +206,7 @@ def test_unreachable_cells_have_no_level():
 def test_statuses_are_the_documented_codes():
     assert [s.name.lower() for s in CellStatus] == [
         "attractor", "stabilized", "escapes", "trapped", "leads_to_these", "avoid",
+        "beyond_gamma",
     ]  # fmt: skip
 
 

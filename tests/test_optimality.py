@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from models import brute_force, dense, random_lp
+from models import brute_force, dense, mdp, random_lp
 
 import lmdsl as lm
 from lmdsl import policy
@@ -135,3 +135,40 @@ def test_claims_hold_in_exact_arithmetic():
             ahead = sum((Fraction(w[j]) * s for j, s in row), Fraction(0)) / total
             rate = Fraction(result.contraction)
             assert Fraction(lp.gamma) * ahead <= rate * Fraction(w[i])
+
+
+def reset(n):
+    """Control 0 advances or starts over with probability 1/2; control 1 always advances."""
+    cells = []
+    for i in range(n):
+        row = {i - 1: 1}
+        row[n - 1] = row.get(n - 1, 0) + 1
+        cells.append([(row, 1.0), ({i - 1: 2}, 1.0)])
+    return cells
+
+
+@pytest.mark.parametrize("n", [60, 400])
+@pytest.mark.parametrize("gamma", [0.5, 1.0, 1.01])
+def test_a_first_policy_that_takes_two_to_the_n_steps(n, gamma):
+    result = lm.solve(mdp(reset(n), 2, gamma))
+    assert result.status == "verified", result.message
+    exact = np.cumsum(gamma ** np.arange(n))
+    np.testing.assert_allclose(result.value[:n], exact, rtol=1e-9)
+
+
+def test_a_corridor_where_news_travels_one_cell_a_step():
+    n = 1500
+    cells = [[({-1: 1}, 1.0)]]
+    cells += [[({-1: 1}, 5000.0), ({i - 1: 1}, 1.0)] for i in range(1, n)]
+    result = lm.solve(mdp(cells, 1, 1.0))
+    assert result.status == "verified", result.message
+    np.testing.assert_allclose(result.value[:n], np.arange(1, n + 1), rtol=1e-9)
+    assert result.iterations < 150
+
+
+def test_true_zeros_are_not_chased():
+    cells = [[({-1: 20}, 1.0), ({0: 10, -1: 10}, 0.0)], [({-1: 20}, 1.0)]]
+    result = lm.solve(mdp(cells, 20, 1.0))
+    assert result.status == "verified"
+    assert result.value[0] == 0
+    assert result.iterations <= 2

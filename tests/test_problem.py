@@ -167,6 +167,16 @@ BAD = [
     ("on_exit", changed("on_exit", value="wrap"), "on_exit", "clip"),
     ("measure of no cell", changed("measure", value={"boxes": [{"x": [0.1, 0.2]}]}),
      "measure.boxes", "no cell"),
+    ("cost mean overflows", changed("stage_cost", value="1e308"), "stage_cost", "overflows"),
+    ("cells 310 digits", changed("state_box", "x", "cells", value=10**310), "state_box.x.cells",
+     ""),
+    ("points 310 digits", changed("control_grid", "u", value={"low": 0, "high": 1,
+                                                              "points": 10**310}), "points", ""),
+    ("per_axis 310 digits", changed("sampling", value={"kind": "grid", "per_axis": 10**310}),
+     "sampling.per_axis", ""),
+    ("many booleans", changed("control_grid", "u", value={"values": [True] * 50_000}),
+     "control_grid.u.values[0]", "True"),
+    ("many boxes", changed("avoid", value={"boxes": [{}] * 10_001}), "avoid.boxes", "10000"),
     ("name number", changed("name", value=3), "name", "3"),
 ]  # fmt: skip
 

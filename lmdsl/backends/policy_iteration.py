@@ -34,8 +34,7 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     value = policy.evaluate(lp, pair)
     if value is None:
         return Solution(Stop.FAILED, "the first policy has no finite value")
-    limit = options.max_iterations if options.max_iterations is not None else 1000
-    done = policy.iterate(lp, pair, value, stop=late, limit=limit)
+    done = policy.iterate(lp, pair, value, stop=late, limit=options.max_iterations)
     stop = Stop.OPTIMAL
     if not done.converged:
         stop = Stop.TIME_LIMIT if late() else Stop.ITERATION_LIMIT

@@ -7,6 +7,7 @@ drawn. A layer takes any matplotlib axes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ DECADES, DEEPEST = 2, 8
 INK, FAINT, HATCH = "#222222", "#999999", "#8c8c8c"
 ATTRACTOR = "#ff2fa0"
 CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
-UNSOLVED, INFINITE = 6, 7
+UNSOLVED, INFINITE = 7, int(CellStatus.BEYOND_GAMMA)
 REGIONS: dict[int, tuple[str, str, str | None]] = {
     UNSOLVED: ("stabilizable", "#dcebf7", None),
     INFINITE: ("no finite cost", "#fde0c2", None),
@@ -136,6 +137,37 @@ def outline(ax: Any, view: View, mask: Bools, colour: str, width: float = 0.9) -
                     linewidths=size,
                     zorder=3.2,
                 )
+
+
+def frames(ax: Any, view: View, boxes: Sequence[Mapping[str, tuple[float, float]]]) -> None:
+    """Outline the boxes (ends by axis name) that meet the slice; split at a seam."""
+    from matplotlib.patches import Rectangle
+
+    p = view.partition
+    centre = p.low + (view.cell + 0.5) * p.width
+    for box in boxes:
+        held = [box[p.names[k]] for k in view.hidden]
+        turns = (p.high - p.low)[list(view.hidden)]
+        if not all(
+            low <= x <= high or low <= x + turn <= high
+            for (low, high), x, turn in zip(held, centre[list(view.hidden)], turns, strict=True)
+        ):
+            continue
+        parts = []
+        for k in view.axes:
+            (low, high), end = box[p.names[k]], float(p.high[k])
+            seam = high > end + 1e-9 * float(p.width[k])
+            whole = [(low, high)]
+            parts.append([(low, end), (float(p.low[k]), high - end + p.low[k])] if seam else whole)
+        for x in parts[0]:
+            for y in parts[1] if len(parts) == 2 else [(0.0, 1.0)]:
+                place = ax.transData if len(parts) == 2 else ax.get_xaxis_transform()
+                ax.add_patch(
+                    Rectangle(
+                        (x[0], y[0]), x[1] - x[0], y[1] - y[0],
+                        fill=False, edgecolor=INK, linewidth=1.0, zorder=3, transform=place,
+                    )
+                )  # fmt: skip
 
 
 def regions(

@@ -50,7 +50,7 @@ def program(
             raise BadInput(
                 f"{shown(state)} is not an axis of state_box; remove it or declare the axis", where
             )
-    known = [*names, *parameters]
+    known = frozenset((*names, *parameters))
     parsed = []
     for state in order:
         try:

@@ -1,0 +1,87 @@
+"""The contract suite for backends: whether a backend, yours or ours, does what it promises.
+
+:func:`check_backend` asks it for small LPs whose answers are derived by hand and judges what it
+claims against what it returns. The record of capabilities decides which checks apply.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from lmdsl import backends
+from lmdsl.backends import Backend
+from lmdsl.errors import BadInput, MissingDependency, shown
+from lmdsl.testing.checks import CHECKS
+from lmdsl.testing.probe import Broken, Probe, Unjudged
+from lmdsl.testing.report import FAILED, PASSED, SKIPPED, Check, ContractFailure, Report
+
+__all__ = ["Check", "ContractFailure", "Report", "check_backend"]
+
+
+def check_backend(
+    backend: str | Backend,
+    *,
+    algorithms: Sequence[str] | None = None,
+    raise_on_failure: bool = True,
+) -> Report:
+    """Run the contract suite on a backend.
+
+    Parameters
+    ----------
+    backend
+        A name, ``"name:algorithm"`` or a Backend.
+    algorithms
+        The algorithms to run with; by default the one named, else all that the record lists, else
+        the backend's own default.
+    raise_on_failure
+        Raise if a check fails.
+
+    Returns
+    -------
+    Report
+        The outcome of every check for every algorithm. Checks that the record rules out, and
+        algorithms that are not installed, are skipped.
+
+    Raises
+    ------
+    ContractFailure
+        A check failed: an AssertionError that lists every failure.
+    BadInput
+        There is no such backend or algorithm, or (MissingDependency) its package is missing.
+    """
+    if isinstance(algorithms, str):
+        raise BadInput(f"{shown(algorithms)} must be a sequence of names", "algorithms")
+    chosen, named = backends.resolve(backend)
+    listed = chosen.capabilities.algorithms
+    wanted: Sequence[str | None]
+    if algorithms is not None:
+        wanted = tuple(algorithms)
+        for algorithm in wanted:
+            if listed and algorithm not in listed:
+                raise BadInput(
+                    f"{shown(algorithm)} is not one of {', '.join(listed)}", "algorithms"
+                )
+    else:
+        wanted = (named,) if named else listed or (None,)
+    found = [check for algorithm in wanted for check in _run(chosen, algorithm)]
+    report = Report(chosen.name, tuple(found))
+    if raise_on_failure and report.failed:
+        raise ContractFailure(report)
+    return report
+
+
+def _run(backend: Backend, algorithm: str | None) -> list[Check]:
+    probe, label = Probe(backend, algorithm), algorithm or ""
+    found = []
+    for name, check in CHECKS.items():
+        outcome, reason = PASSED, (check.__doc__ or "").strip()
+        try:
+            check(probe)
+        except Broken as fault:
+            outcome, reason = FAILED, f"{fault}."
+        except Unjudged as why:
+            outcome, reason = SKIPPED, f"{why}."
+        except MissingDependency as absent:
+            return [Check("available", label, SKIPPED, f"{absent.message}.")]
+        found.append(Check(name, label, outcome, reason))
+    return found

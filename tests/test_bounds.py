@@ -1,0 +1,104 @@
+"""Rounded bounds against exact rationals, the smallest and largest doubles included."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from models import mdp, random_lp
+from problems import made, steps
+
+import lmdsl as lm
+from lmdsl import bounds, certificate
+from lmdsl.bounds import exact_backup
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-300, 1e-310, 1e280])
+@pytest.mark.parametrize("gamma", [1.3, 1e-7, 1e30])
+def test_bounds_enclose_the_exact_value(scale, gamma):
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        lp = random_lp(rng, 6, gamma=1.3, samples=7)
+        if not lp.n:
+            continue
+        pair = lp.pair_pointer[:-1].copy()
+        x = rng.random(lp.n) * 10.0 ** rng.integers(-9, 9, lp.n) * scale
+        above = bounds.expected_above(lp, pair, x, gamma)
+        below = bounds.backup_below(lp, x, gamma, lp.cost)
+        for i, k in enumerate(pair):
+            exact = exact_backup(lp, int(k), x, gamma, None)
+            if np.isfinite(above[i]):
+                assert Fraction(above[i]) >= exact
+                total = bounds.add_above(above[i : i + 1], lp.cost[k : k + 1])[0]
+                if np.isfinite(total):
+                    assert Fraction(total) >= Fraction(above[i]) + Fraction(float(lp.cost[k]))
+            columns = range(lp.pair_pointer[i], lp.pair_pointer[i + 1])
+            least = min(exact_backup(lp, j, x, gamma, lp.cost) for j in columns)
+            if np.isfinite(below[i]):
+                assert Fraction(below[i]) <= least
+
+
+def test_decrease_is_rounded_down():
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        lp = random_lp(rng, 6, gamma=1.0, samples=7)
+        if not lp.n:
+            continue
+        pair = lp.tree[1]
+        w = rng.random(lp.n) + 1.0
+        w = w + bounds.expected_above(lp, pair, w, 1.0)
+        d = bounds.decrease(lp, pair, w, 1.0)
+        if d is None:
+            continue
+        for i, k in enumerate(pair):
+            exact = Fraction(float(w[i])) - exact_backup(lp, int(k), w, 1.0, None)
+            assert 0 < Fraction(d[i]) <= exact
+
+
+def test_rounded_down():
+    for q in (Fraction(1, 3), Fraction(2, 3), Fraction(1, 10), Fraction(7, 10)):
+        assert Fraction(bounds._rounded_down(q)) <= q
+
+
+def test_too_many_open_rows_are_no_yes(monkeypatch):
+    lp = lm.compile(made(steps()))
+    W = np.array([1e3, 2e3, 3e3])  # each cell's step down breaks it
+    monkeypatch.setattr(bounds, "MAX_EXACT", 1)
+    assert bounds.undecided(lp, W, lp.gamma, lp.cost) is None
+    assert not bounds.holds_for_all(lp, W, lp.gamma, lp.cost)
+
+
+def test_the_gap_divides_by_the_upper_value():
+    lp = lm.compile(made(steps()))
+    V = np.ones(lp.n)
+    assert certificate.gap(lp, V, V / 2) == pytest.approx(0.5)
+
+
+def test_shares_below_the_normal_range_prove_nothing_false():
+    formula = (
+        "where(x < 0.5, 0.1, where(w > 0, 0.1 + 0.25*where(x - floor(4*x)/4 < 0.125, 1, 0), 0.1))"
+    )
+    data = {
+        "format": "lmdsl/1",
+        "system": {"kind": "map", "next": {"x": formula}},
+        "state_box": {"x": {"low": 0, "high": 1, "cells": 4}},
+        "attractor": {"cells": [[0]]},
+        "control_grid": {},
+        "noise": {"w": {"values": [0, 1], "weights": [1 - 5e-324, 5e-324]}},
+        "stage_cost": "where(x < 0.5, 1e300, 0)",
+        "sampling": {"kind": "grid", "per_axis": 2},
+    }
+    lp = lm.compile(made(data))
+    result = lm.solve(lp)
+    if result.certificate.upper_bound:
+        V = result.value[lp.cells]
+        for i, k in enumerate(lp.pair_pointer[:-1]):
+            assert Fraction(V[i]) >= exact_backup(lp, int(k), V, lp.gamma, lp.cost)
+
+
+def test_underflow_before_gamma_proves_nothing_false():
+    lp = mdp([[({-1: 10}, 5e-324)], [({0: 3, -1: 7}, 0.0)]], 10, 1e25)
+    assert not certificate.check_upper(lp, np.array([0, 1]), np.array([5e-324, 2e-300]))
+    lp = mdp([[({-1: 10}, 5e-324)], [({0: 6, -1: 4}, 0.0)]], 10, 1e200)
+    assert not certificate.check_lower(lp, np.array([5e-324, 4.5e-124]))

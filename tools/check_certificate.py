@@ -1,0 +1,197 @@
+#!/usr/bin/env python3
+"""Check a certificate that lmdsl exported. Needs nothing but Python, and no part of lmdsl.
+
+    python3 check_certificate.py FILE
+
+The file describes a Markov decision process and claims something about it. It has one JSON value
+per line; every double is written in hexadecimal, so that it is read without any rounding.
+
+  line 1      the head: gamma, the numbers n of cells and K of pairs, `total`, what is claimed
+  n lines     cell i = 0, ..., n-1: m (its weight), policy (its control), V_up, W, w, mu
+  K lines     [i, control, cost, [[j, c], ...]]: in cell i this control costs `cost` and leads to
+              cell j with probability c/total; j = n is the attractor, where all cost ends
+
+Write P_a x for the expected value of x after the pair a, with x = 0 in the attractor, and P_u for
+the pairs of the policy u; g = max(gamma, 1). A policy comes with the claims
+
+  1 stabilizing   w > 0 and w > g P_u w: the spectral radius of g P_u is below 1, so the attractor
+                  is reached almost surely from every cell
+  2 upper bound   V_up >= 0 and V_up >= gamma P_u V_up + cost: the policy costs at most m'V_up
+  3 lower bound   W >= 0 and W <= gamma P_a W + cost for ALL pairs a: no policy costs less than m'W
+  4 measure       mu >= 0 and ||m - mu + gamma P_u' mu||_1 <= 1e-9: the Lyapunov measure
+  5 gap           (m'V_up - m'W) / m'V_up is at most the tolerance
+
+and a refusal with
+
+  6 refusal       w >= 0, w != 0 and w <= gamma P_a w for ALL pairs a: no policy has a finite
+                  weighted occupation from the cells with w > 0
+
+Everything is decided with exact rational numbers. Exit status: 0 if every claim holds, 1 if one
+fails, 2 if the file cannot be read as a certificate. What is not checked here: that this process is
+the model of some problem (`lmdsl verify` recompiles it; model_sha256 names it).
+"""
+
+import json
+import math
+import sys
+from fractions import Fraction
+
+NAMES = {1: "stabilizing", 2: "upper bound", 3: "lower bound", 4: "measure", 5: "gap", 6: "refusal"}
+
+
+def need(condition, message):
+    """Stop unless the file is as described above."""
+    if not condition:
+        raise ValueError(message)
+
+
+def whole(value, low, high):
+    """Say whether a JSON value is an integer with low <= value < high."""
+    return type(value) is int and low <= value < high
+
+
+def read_pairs(lines, n, K, total):
+    """Yield (i, control, cost, row) for each of the K pairs; every cell must have one."""
+    last = (-1, -1)
+    for k in range(K):
+        i, control, cost, row = json.loads(next(lines))
+        need(whole(i, 0, n) and whole(control, 0, 2**31), f"pair {k}: no such cell or control")
+        # By cell, then control: no pair twice, and no cell left out.
+        need(last < (i, control) and i <= last[0] + 1, f"pair {k} is out of order")
+        last = (i, control)
+        cost = float.fromhex(cost)
+        need(0 <= cost < math.inf, f"pair {k}: the cost is not a finite number >= 0")
+        need(all(whole(j, 0, n + 1) for j, _ in row), f"pair {k}: no such target")
+        need(all(whole(c, 1, total + 1) for _, c in row), f"pair {k}: no such probability")
+        need(sum(c for _, c in row) == total, f"pair {k}: the probabilities do not sum to 1")
+        yield i, control, Fraction(cost), row
+    need(last[0] == n - 1, "a cell has no pair")
+    need(next(lines, None) is None, "there are more pairs than the head says")
+
+
+def check(lines):
+    """Return ({claim: why it fails, or None}, sentences that state the numbers)."""
+    head = json.loads(next(lines))
+    need(head["format"] == "lmdsl-certificate/1", "the format is not lmdsl-certificate/1")
+    need(head["kind"] in ("policy", "refusal"), "the kind is neither policy nor refusal")
+    n, K, total = head["cells"], head["pairs"], head["total"]
+    need(all(whole(size, 1, math.inf) for size in (n, K, total)), "a size is not an integer >= 1")
+    gamma = float.fromhex(head["gamma"])
+    need(0 < gamma < math.inf, "gamma is not a finite number > 0")
+    cells = [json.loads(next(lines)) for _ in range(n)]
+    pairs = read_pairs(lines, n, K, total)
+    share, g_share = Fraction(gamma) / total, Fraction(max(gamma, 1)) / total
+    if head["kind"] == "refusal":
+        return check_refusal(cells, pairs, share)
+    return check_policy(head, cells, pairs, share, g_share)
+
+
+def vector(cells, name, verdict, claim, positive=False):
+    """Return integers X and an integer D with x = X/D exactly, and a 0 for the attractor.
+
+    A double is an integer over a power of two, so the largest denominator serves for all. Where a
+    number has the wrong sign or is not finite, the claim fails.
+    """
+    x = [float.fromhex(cell[name]) for cell in cells]
+    bad = [i for i, v in enumerate(x) if not (0 <= v < math.inf and (v > 0 or not positive))]
+    if bad:
+        wanted = "> 0" if positive else ">= 0"
+        verdict[claim] = f"{name} of cell {bad[0]} is not a finite number {wanted}"
+        return [0] * (len(x) + 1), 1
+    ratios = [v.as_integer_ratio() for v in x]
+    D = max(denominator for _, denominator in ratios)
+    return [numerator * (D // denominator) for numerator, denominator in ratios] + [0], D
+
+
+def check_refusal(cells, pairs, share):
+    """Claim 6; `share` is gamma/total, so that share * sum(c * w_j) is gamma P_a w."""
+    verdict = {6: None}
+    w, _ = vector(cells, "w", verdict, 6)
+    count = sum(value > 0 for value in w)
+    if not count and not verdict[6]:
+        verdict[6] = "w is 0 everywhere"
+    for i, control, _, row in pairs:
+        if not w[i] <= share * sum(c * w[j] for j, c in row):
+            verdict[6] = verdict[6] or f"w > gamma P_a w in cell {i}, control {control}"
+    return verdict, [f"w > 0 in {count} of {len(cells)} cells"]
+
+
+def check_policy(head, cells, pairs, share, g_share):
+    """Claims 1 to 5; share = gamma/total as above, g_share = g/total."""
+    n, verdict = len(cells), dict.fromkeys(range(1, 6))
+
+    def fail(claim, why):
+        verdict[claim] = verdict[claim] or why
+
+    w, _ = vector(cells, "w", verdict, 1, positive=True)
+    V_up, D_V = vector(cells, "V_up", verdict, 2)
+    W, D_W = vector(cells, "W", verdict, 3)
+    mu, D_mu = vector(cells, "mu", verdict, 4)
+    m, D_m = vector(cells, "m", verdict, 4)
+    found = 0  # cells whose policy is a pair of the file
+    least = Fraction(1)  # min over the cells of (w - g P_u w)/w
+    inflow = [0] * (n + 1)  # P_u' mu, times total and D_mu
+
+    for i, control, cost, row in pairs:
+        # Claim 3 ranges over all pairs: this is where a better policy would show.
+        if not W[i] <= share * sum(c * W[j] for j, c in row) + cost * D_W:
+            fail(3, f"W > gamma P_a W + cost in cell {i}, control {control}")
+        if control != cells[i]["policy"]:
+            continue
+        found += 1  # controls ascend within a cell, so at most one pair of a cell comes here
+        if not verdict[1]:
+            decrease = w[i] - g_share * sum(c * w[j] for j, c in row)
+            if decrease > 0:
+                least = min(least, decrease / w[i])
+            else:
+                fail(1, f"w <= g P_u w in cell {i}")
+        if not V_up[i] >= share * sum(c * V_up[j] for j, c in row) + cost * D_V:
+            fail(2, f"V_up < gamma P_u V_up + cost in cell {i}")
+        for j, c in row:
+            inflow[j] += c * mu[i]  # claim 4
+    need(found == n, "the policy of a cell is no pair of the file")
+    need(abs(Fraction(sum(m), D_m) - 1) <= 1e-9, "m does not sum to 1")
+    residual = sum(
+        abs(Fraction(m[i], D_m) - Fraction(mu[i], D_mu) + share * Fraction(inflow[i], D_mu))
+        for i in range(n)
+    )
+    if not residual <= 1e-9:
+        fail(4, f"the residual is {float(residual):.3g}, above 1e-9")
+    cost = Fraction(sum(a * b for a, b in zip(m, V_up, strict=True)), D_m * D_V)
+    lower = Fraction(sum(a * b for a, b in zip(m, W, strict=True)), D_m * D_W)
+    gap = (cost - lower) / cost if cost else Fraction(0)
+    if verdict[2] or verdict[3]:
+        fail(5, "there is no gap without both bounds")
+    if not gap <= float.fromhex(head["tolerance"]):  # a comparison with a double is exact
+        fail(5, f"the gap {float(gap):.3g} is above the tolerance")
+    # The numbers stated in the head: the upper ones may be too high, the lower one too low.
+    for claim, name, value, sign in (
+        (1, "contraction", 1 - least, 1), (2, "cost", cost, 1), (3, "lower_bound", lower, -1),
+    ):  # fmt: skip
+        stated = head[name]
+        if stated is None or not sign * Fraction(float.fromhex(stated)) >= sign * value:
+            fail(claim, f"{name} is stated as {stated}, but is {float(value)!r}")
+    return verdict, [
+        f"cost m'V_up {float(cost)!r}, lower bound m'W {float(lower)!r}, gap {float(gap):.3g}",
+        f"contraction {float(1 - least)!r}, residual of the measure {float(residual):.3g}",
+    ]
+
+
+def main(arguments):
+    """Check one file, print the verdicts and return the exit status."""
+    try:
+        (path,) = arguments
+        with open(path, encoding="ascii") as lines:
+            verdict, numbers = check(lines)
+    except (OSError, ArithmeticError, LookupError, RuntimeError, StopIteration, TypeError,
+            ValueError) as error:  # fmt: skip
+        print(f"not a certificate: {type(error).__name__}: {error}")
+        return 2
+    for claim, why in verdict.items():
+        print(f"claim {claim} {NAMES[claim]}: " + (f"FAILS: {why}" if why else "holds"))
+    print(*numbers, sep="\n")
+    return 1 if any(verdict.values()) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
