@@ -197,3 +197,18 @@ def test_the_papers_example():
     assert result.gap <= 1e-6
     runs = result.simulate(starts=10_000, steps=10_000, seed=0)
     assert runs.reached >= 9_990
+
+
+@pytest.mark.long
+def test_the_papers_example_on_every_backend():
+    found = lm.compare(made(standard_map()))
+    assert [result.backend for result in found.results] == [
+        "policy-iteration", "highs", "clarabel", "cvxpy",
+    ]  # fmt: skip
+    for result in found.results:
+        assert result.status == "verified", result.message
+        assert result.gap <= 1e-6
+        assert (result.lp.n, result.lp.K) == (2496, 52416)
+    assert found.agreement.cost <= 1e-6
+    assert found.agreement.controls == 1
+    assert found.exit_status == 0
