@@ -250,7 +250,12 @@ def explained(lp: StabilizationLP, pair: Pairs | None, certificate: Certificate)
             shown = certificate.measure_residual
             reasons.append(
                 "the Lyapunov measure could not be established"
-                + ("" if shown is None else f": its residual is {shown:.2g}, above 1e-9")
+                + (
+                    ""
+                    if shown is None
+                    else f": its residual is {shown:.2g}, above 1e-9, the numbers no longer "
+                    "allow it; lower gamma"
+                )
             )
         width = certificate.gap
         if width is not None and width > certificate.tolerance:

@@ -121,7 +121,7 @@ def solve(
         progress=progress,
     )
     if isinstance(first, policy.Undecided):
-        word = "time limit" if late() else "gamma too close to its limit"
+        word = "time limit" if late() else "undecided"
         stop = Stop.TIME_LIMIT if late() else Stop.FAILED
         solution = Solution(stop, word, pair=first.pair)
     else:
@@ -330,8 +330,8 @@ class _Job:
                 message = f"{solution.stop.value} ({solution.word}); {message}"
             elif undecided:
                 message = (
-                    f"gamma = {self.lp.gamma!r} is so close to its limit that the numbers decide "
-                    f"neither way; {message}"
+                    f"gamma = {self.lp.gamma!r} is so close to its limit, or the way to the "
+                    f"attractor so long, that the numbers decide neither way; {message}"
                 )
         return self._result(
             verified.witness,
