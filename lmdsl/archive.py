@@ -115,7 +115,8 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
                 os.rename(work / "old", target)
             raise
         finally:
-            shutil.rmtree(work, ignore_errors=True)
+            if target.exists() or not (work / "old").exists():
+                shutil.rmtree(work, ignore_errors=True)  # never the only copy of an old result
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise BadInput(f"cannot write {shown(str(path), 200)}: {reason}", "out") from None

@@ -206,6 +206,27 @@ def test_nothing_is_left_behind_by_a_failed_save(file, tmp_path, monkeypatch):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "problem.json"]
 
 
+def test_an_old_result_survives_a_failed_restoration(file, tmp_path, monkeypatch):
+    result = lm.solve(lm.load(file(steps())))
+    result.save(tmp_path / "out")
+    from lmdsl import archive
+
+    renamed = os.rename
+    calls = []
+
+    def fail(a, b):
+        calls.append(a)
+        if len(calls) in (2, 3):  # putting the new one in place, and the old one back
+            raise OSError(5, "Input/output error")
+        renamed(a, b)
+
+    monkeypatch.setattr(archive.os, "rename", fail)
+    with pytest.raises(lm.BadInput):
+        result.save(tmp_path / "out")
+    kept = list(tmp_path.glob(".out.*/old/solution.npz"))
+    assert len(kept) == 1
+
+
 def spoil_certificate(folder, **changes):
     path = folder / "certificate.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))

@@ -1,0 +1,251 @@
+"""Kill at any moment, Ctrl-C, limits, and the same bytes from run to run and thread to thread."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import interrupted_saves
+import numpy as np
+import pytest
+from problems import made, standard_map, steps
+
+import lmdsl as lm
+
+HERE = Path(__file__).parent
+posix = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and signals")
+
+
+def killing(*arguments):
+    program = str(HERE / "interrupted_saves.py")
+    done = subprocess.run(  # Python 3.12 deprecates forking among threads: BLAS keeps idle ones
+        [sys.executable, "-W", "ignore::DeprecationWarning", program, *map(str, arguments)],
+        capture_output=True, text=True, check=False, timeout=600,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@posix
+@pytest.mark.long
+def test_killed_at_random_moments(tmp_path):
+    found = killing("random", tmp_path, 200, 0)
+    print(found)
+    outcomes = ("old", "new", "none, none before", "none, one before")
+    assert sum(found.get(name, 0) for name in outcomes) == 200
+    assert found["old"] > 0  # kills did fall into saves
+    assert found["left behind"] > 0
+    assert found["saves finished"] > 0
+
+
+@posix
+@pytest.mark.long
+def test_killed_at_every_line(tmp_path):
+    found = killing("lines", tmp_path)
+    print(found)
+    assert found["old"] > 30
+    assert found["new"] >= 1
+    assert found["none"] <= 2  # between the two renames
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # from the tracing
+def test_interrupted_at_every_line_of_a_save(tmp_path):
+    """Ctrl-C during a save never loses the directory: it is the old one or the new one."""
+    results = interrupted_saves.solved()
+    target = tmp_path / "out"
+
+    def interrupt():
+        raise KeyboardInterrupt
+
+    tracer, interruptions, left = sys.gettrace(), 0, 0
+    for line in itertools.count(1):
+        results[0].save(target)
+        interrupted_saves.at_line(line, interrupt)
+        try:
+            results[1].save(target)
+        except KeyboardInterrupt:
+            interruptions += 1
+        else:
+            break
+        finally:
+            sys.settrace(tracer)
+        assert interrupted_saves.gamma_held(target, results) in (1.0, 1.01)
+        left += bool(interrupted_saves.leftovers(target))
+        for path in interrupted_saves.leftovers(target):
+            assert path.name.startswith(".out.")
+            shutil.rmtree(path)
+    print(interruptions, left)
+    assert interruptions > 30
+    assert left <= 3  # an interrupted clean-up
+
+
+# Ctrl-C -------------------------------------------------------------------------------------
+
+
+def start(folder, data, **streams):
+    (folder / "problem.json").write_text(json.dumps(data))
+    return subprocess.Popen(
+        [sys.executable, "-m", "lmdsl", "solve", "problem.json", "--out", "out"],
+        cwd=folder, stdout=subprocess.PIPE, **streams,
+    )  # fmt: skip
+
+
+@posix
+def test_ctrl_c(tmp_path):
+    started = time.monotonic()
+    process = start(tmp_path, steps(), stderr=subprocess.PIPE)
+    assert process.communicate(timeout=120)[1] == b""
+    assert process.returncode == 0
+    imports = time.monotonic() - started
+    folder = tmp_path / "large"
+    folder.mkdir()
+    process = start(folder, standard_map(300), stderr=subprocess.PIPE)
+    time.sleep(imports + 0.3)
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 130
+    assert err == b"lmdsl: interrupted\n"
+    assert out == b""
+    assert [path.name for path in folder.iterdir()] == ["problem.json"]
+
+
+@posix
+@pytest.mark.parametrize(
+    "stage", ["transitions", pytest.param("solve", marks=pytest.mark.long),
+              pytest.param("verify", marks=pytest.mark.long)],
+)  # fmt: skip
+def test_ctrl_c_on_a_terminal(tmp_path, stage):
+    ours, theirs = os.openpty()
+    process = start(tmp_path, standard_map(300), stderr=theirs)
+    os.close(theirs)
+    screen, sent, deadline = b"", False, time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if not select.select([ours], [], [], 1)[0]:
+            continue
+        try:
+            said = os.read(ours, 1000)
+        except OSError:  # closed
+            break
+        if not said:
+            break
+        screen += said
+        if not sent and stage.encode() in screen:
+            process.send_signal(signal.SIGINT)
+            sent = True
+    os.close(ours)
+    out = process.communicate(timeout=120)[0]
+    assert sent
+    assert out == b""
+    assert process.returncode == 130
+    assert screen.endswith(b"\r\x1b[Klmdsl: interrupted\r\n")
+    assert screen.count(b"\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["problem.json"]
+
+
+# The same bytes -----------------------------------------------------------------------------
+
+NOISY = {
+    "format": "lmdsl/1",
+    "system": {"kind": "map", "next": {"x": "1.3*x + u + w"}},
+    "state_box": {"x": {"low": -1, "high": 1, "cells": 200}},
+    "attractor": {"boxes": [{"x": [-0.1, 0.1]}]},
+    "control_grid": {"u": {"low": -0.5, "high": 0.5, "points": 21}},
+    "noise": {"w": {"normal": {"std": 0.03, "points": 7}}},
+    "stage_cost": "x**2 + u**2",
+    "sampling": {"kind": "random", "points": 20, "seed": 3},
+    "gamma": 1.01,
+}
+HASHES = """
+import hashlib, json, sys
+import numpy as np
+import lmdsl as lm
+found = {}
+for k, (data, backend) in enumerate(json.load(sys.stdin)):
+    result = lm.solve(lm.Problem.model_validate(data), backend)
+    assert result.status == "verified", result.message
+    result.save(f"out{k}")
+    with np.load(f"out{k}/solution.npz", allow_pickle=False) as arrays:
+        for name in arrays.files:
+            found[f"{k} {name}"] = hashlib.sha256(arrays[name].tobytes()).hexdigest()
+print(json.dumps(found))
+"""
+
+
+@posix
+def test_same_bytes_in_every_process(tmp_path):
+    jobs = [(standard_map(30), "policy-iteration"), (NOISY, "policy-iteration"), (NOISY, "highs")]
+    jobs.append((standard_map(30), "highs"))
+    processes = []
+    for run, threads in enumerate((1, 2, 1)):
+        names = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+        folder = tmp_path / str(run)
+        folder.mkdir()
+        done = subprocess.run(
+            [sys.executable, "-c", HASHES],
+            input=json.dumps(jobs), cwd=folder, capture_output=True, text=True, check=False,
+            env={**os.environ, **dict.fromkeys(names, str(threads))}, timeout=600,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        processes.append(json.loads(done.stdout))
+    assert len(processes[0]) == 6 * len(jobs)
+    assert processes[0] == processes[1] == processes[2]
+    # And the controller is the same one whoever solved it.
+    assert processes[0]["1 control_index"] == processes[0]["2 control_index"]
+    assert processes[0]["0 control_index"] == processes[0]["3 control_index"]
+
+
+# Limits -------------------------------------------------------------------------------------
+
+
+def bracketed(result):
+    """The best certified answer so far: stabilizing, both bounds proved, the gap stated."""
+    proof = result.certificate
+    assert proof.stabilizing
+    assert proof.upper_bound
+    assert proof.lower_bound
+    assert np.isfinite([result.cost, result.lower_bound, result.gap, result.contraction]).all()
+    assert 0 <= result.lower_bound <= result.cost
+    assert result.gap == pytest.approx(1 - result.lower_bound / result.cost, rel=1e-6)
+    assert result.contraction < 1
+
+
+def test_iteration_limit():
+    problem = made(standard_map(20))
+    best = lm.solve(problem)
+    gaps = []
+    for limit in (1, 2, 3):
+        result = lm.solve(problem, max_iterations=limit)
+        bracketed(result)
+        assert result.lower_bound <= best.cost
+        assert result.cost >= best.lower_bound
+        gaps.append(result.gap)
+        if limit == 1:
+            assert result.status == "solver_failed"
+            assert result.exit_status == 4
+            assert "iteration limit" in result.message
+            assert f"the gap {result.gap:.3g} is above" in result.message
+    assert gaps == sorted(gaps, reverse=True)
+
+
+@pytest.mark.parametrize("limit", [1e-9, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1])
+def test_time_limit(limit, tmp_path):
+    result = lm.solve(made(standard_map(20)), time_limit=limit)
+    assert result.status in ("solver_failed", "verified")
+    bracketed(result)
+    if result.status != "verified":
+        assert "time limit" in result.message
+        assert f"the gap {result.gap:.3g} is above" in result.message
+    if limit == 1e-9:
+        assert result.status == "solver_failed"
+    result.save(tmp_path / "out")
+    loaded = lm.Result.load(tmp_path / "out")
+    assert (loaded.cost, loaded.gap, loaded.status) == (result.cost, result.gap, result.status)
