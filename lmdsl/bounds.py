@@ -141,6 +141,14 @@ def raise_from_zero(lp: StabilizationLP, gamma: float, cost: Floats, sweeps: int
     return x
 
 
+def total(values: Floats) -> float:
+    """Return the sum of values >= 0, correctly rounded; infinite where it overflows."""
+    try:
+        return math.fsum(values)
+    except OverflowError:
+        return math.inf
+
+
 def weighted(weight: Floats, values: Floats, direction: float) -> float:
     """Return weight'values rounded towards ``direction`` (an infinity), for values >= 0.
 
@@ -150,7 +158,7 @@ def weighted(weight: Floats, values: Floats, direction: float) -> float:
     top = float(values.max(initial=0.0))
     if not np.isfinite(top) or top > 1e280:
         with np.errstate(over="ignore"):
-            rough = math.fsum(weight * values) if np.isfinite(top) else math.inf
+            rough = total(weight * values)
         return rough * (1 + math.copysign(4 * UNIT, direction))
     product = weight * values
     a, b = _halves(weight), _halves(values)

@@ -151,8 +151,8 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
         residual = np.abs((lp.weight - mu) + inflow)
     if not np.isfinite(residual).all():
         return math.inf
-    bound = math.fsum(residual + rounding) * (1 + 4 * bounds.UNIT)
-    hopeful = bound - 2 * math.fsum(rounding) <= MEASURE_TOLERANCE < bound
+    bound = bounds.total(residual + rounding) * (1 + 4 * bounds.UNIT)
+    hopeful = bound - 2 * bounds.total(rounding) <= MEASURE_TOLERANCE < bound
     if hopeful and len(P.data) <= bounds.MAX_EXACT:
         return _exact_residual(lp, pair, mu)
     return bound
@@ -169,7 +169,7 @@ def _exact_residual(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
         abs(Fraction(float(lp.weight[j])) - Fraction(float(mu[j])) + gamma * inflow[j] / total)
         for j in range(lp.n)
     )
-    return float(np.nextafter(float(residual), math.inf))
+    return float(np.nextafter(float(min(residual, 1)), math.inf))  # above 1 it is refused anyway
 
 
 def check_refusal(lp: StabilizationLP, w: Floats) -> bool:
@@ -222,7 +222,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
 
 def weighted(lp: StabilizationLP, values: Floats) -> float:
     """Return m'values, rounded to nearest."""
-    return math.fsum(lp.weight * values)
+    return bounds.total(lp.weight * values)
 
 
 def is_policy(lp: StabilizationLP, pair: Pairs) -> bool:

@@ -119,6 +119,11 @@ class NoiseValues(Declared):
                 raise BadInput(
                     f"{weight!r} is negative; weights are probabilities", f"weights[{i}]"
                 )
+        for i, weight in enumerate(self.weights):
+            if weight > 1 + 1e-9:
+                raise BadInput(
+                    f"{weight!r} is more than 1; weights are probabilities", f"weights[{i}]"
+                )
         total = math.fsum(self.weights)
         if abs(total - 1) > 1e-9:
             raise BadInput(f"the weights sum to {total!r}; they must sum to 1", "weights")

@@ -7,6 +7,7 @@ inequality becomes one between integers. Written for clarity: a few microseconds
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any
@@ -27,6 +28,7 @@ Floats = NDArray[np.float64]
 Row = list[tuple[int, int]]
 
 BLOCK = 2**14
+LARGEST = Fraction(sys.float_info.max)
 
 
 def check_exactly(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
@@ -80,6 +82,8 @@ def _mean(lp: StabilizationLP, values: list[Fraction]) -> Fraction:
 
 
 def _up(value: Fraction) -> float:
+    if abs(value) > LARGEST:
+        return math.inf if value > 0 else -sys.float_info.max
     near = float(value)
     return near if Fraction(near) >= value else float(np.nextafter(near, math.inf))
 

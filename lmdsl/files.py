@@ -15,6 +15,7 @@ from lmdsl.errors import BadInput, shown
 
 MAX_FILE_BYTES = 16 * 2**20
 MAX_NESTING = 32
+MAX_ITEMS = 1_000_000
 
 
 def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
@@ -101,6 +102,8 @@ def strict_json(content: bytes, null: bool = False) -> Any:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise BadInput(f"not UTF-8 text (byte {error.start})") from None
+    if text.count(",") > MAX_ITEMS:
+        raise BadInput(f"more than {MAX_ITEMS} items; use a smaller problem")
     try:
         data = json.loads(
             text,

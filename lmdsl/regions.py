@@ -39,6 +39,8 @@ class Regions:
     def weight(self, cells: NDArray[np.integer]) -> NDArray[np.float64]:
         """Return m on the cells of C: their mass scaled to sum 1, all zero where they have none."""
         mass = self.mass[cells]
+        if mass.max(initial=0.0) > 1e290:
+            mass = mass / mass.max()  # the sum would overflow
         total = math.fsum(mass)
         return mass / total if total > 0 else np.zeros(len(cells))
 

@@ -248,3 +248,13 @@ def test_directed_sums_are_exact(seed, decades):
     up, down = weighted(m, V, np.inf), weighted(m, V, -np.inf)
     assert Fraction(down) <= exact <= Fraction(up)
     assert up <= np.nextafter(down, np.inf)
+
+
+def test_the_largest_doubles_are_refused_without_overflow():
+    lp = lm.compile(made(steps()))
+    pair, ones = lp.tree[1], np.ones(lp.n)
+    huge = np.full(lp.n, 1.7e308)
+    for vectors in ({"mu": huge}, {"V_up": huge}, {"W": huge}, {"w": huge}):
+        witness = replace(Witness(pair, ones, ones, ones, ones), **vectors)
+        for judge in (check, check_exactly):
+            assert not judge(lp, witness, 1e-6).verified

@@ -22,6 +22,10 @@ def test_kinds_of_weights():
     assert weight({"density": "2", "boxes": [{"x": [0.5, 1]}]}) == [0, 0.5, 0.5]
 
 
+def test_weights_near_the_largest_double():
+    assert weight({"weights": [0, 1e308, 1e308, 1.7e308]})[0] == pytest.approx(1 / 3.7)
+
+
 @pytest.mark.parametrize(
     ("measure", "where", "word"),
     [

@@ -147,6 +147,8 @@ BAD = [
      "noise.w.weights", "1.1"),
     ("noise negative", changed("noise", value={"w": {"values": [0, 1], "weights": [1.5, -0.5]}}),
      "noise.w.weights[1]", "-0.5"),
+    ("noise huge", changed("noise", value={"w": {"values": [0, 1], "weights": [1e308, 1e308]}}),
+     "noise.w.weights[0]", "1e+308"),
     ("noise lengths", changed("noise", value={"w": {"values": [0], "weights": [0.5, 0.5]}}),
      "noise.w.weights", "2 weights"),
     ("noise std", changed("noise", value={"w": {"normal": {"std": -1, "points": 3}}}),
