@@ -55,6 +55,8 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
 
     scaled = ScaledLP.of(lp)
     algorithm = options.algorithm or next(iter(ALGORITHMS))
+    if scaled.late(options.time_limit):
+        return scaled.too_late()
     dual = algorithm.startswith("dual")
     form = _dual_form(clarabel, scaled) if dual else _primal_form(clarabel, scaled)
     try:

@@ -86,6 +86,8 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
 
         scaled = ScaledLP.of(lp)
         solver = _solver(cvxpy, options.algorithm)
+        if scaled.late(options.time_limit):
+            return scaled.too_late()
         passed, unsupported = _passed(solver, options, scaled.seconds_left(options.time_limit))
         details = {"solver": solver}
         if unsupported:

@@ -83,6 +83,8 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     highs = highspy.Highs()
     highs.setOptionValue("output_flag", False)
     _choose(highs, options, scaled.seconds_left(options.time_limit))
+    if scaled.late(options.time_limit):
+        return scaled.too_late()
     try:
         highs.passModel(_model(highspy, scaled))
         highs.run()

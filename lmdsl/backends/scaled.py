@@ -60,6 +60,10 @@ class ScaledLP:
         """Return whether a time limit has passed."""
         return self.seconds_left(limit) == 0.0
 
+    def too_late(self) -> Solution:
+        """Return the solution where building the LP has used up the time: solvers may not look."""
+        return Solution(Stop.TIME_LIMIT, "time limit reached before the solver started")
+
     def solution(
         self,
         stop: Stop,
