@@ -43,7 +43,6 @@ def improve(
     V: Floats,
     gamma: float | None = None,
     cost: Floats | None = None,
-    allowed: NDArray[np.bool_] | None = None,
 ) -> Improvement:
     """Apply the Bellman operator to V, shape (n,).
 
@@ -53,15 +52,13 @@ def improve(
         The model and a value vector on C.
     gamma, cost
         Other than the LP's own; ``cost`` has shape (K,).
-    allowed
-        Columns to minimise over, shape (K,); a cell without one gets infinity and column -1.
     """
     value, pair = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
     rows = lp.rows
     _improve(
         lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
         lp.cost if cost is None else cost, lp.gamma if gamma is None else gamma, padded(V),
-        np.empty(0, dtype=np.bool_) if allowed is None else allowed, value, pair,
+        value, pair,
     )  # fmt: skip
     return Improvement(value, pair)
 
@@ -78,12 +75,10 @@ def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDAr
 
 
 @njit(cache=True, nogil=True)
-def _improve(pair_pointer, pointer, target, code, share, cost, gamma, V, allowed, value, pair):  # type: ignore[no-untyped-def]
+def _improve(pair_pointer, pointer, target, code, share, cost, gamma, V, value, pair):  # type: ignore[no-untyped-def]
     for i in range(len(pair_pointer) - 1):
         best, choice = np.inf, -1
         for k in range(pair_pointer[i], pair_pointer[i + 1]):
-            if len(allowed) and not allowed[k]:
-                continue
             q = 0.0
             for e in range(pointer[k], pointer[k + 1]):
                 q += share[code[e]] * V[target[e]]

@@ -88,7 +88,6 @@ def iterate(
     value: Floats,
     gamma: float | None = None,
     cost: Floats | None = None,
-    allowed: Bools | None = None,
     stop: Stop = lambda: False,
     limit: int | None = None,
 ) -> Iteration:
@@ -104,7 +103,7 @@ def iterate(
             return Iteration(pair, value, step, False)
         new, lowered = pair, value
         for _ in range(step + 1):
-            better = bellman.improve(lp, lowered, gamma, cost, allowed)
+            better = bellman.improve(lp, lowered, gamma, cost)
             change = (better.value < lowered - TIE * np.abs(lowered)) & (better.pair != new)
             if not change.any():
                 break
