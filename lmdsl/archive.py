@@ -27,12 +27,14 @@ from lmdsl import memory
 from lmdsl.certificate import CLAIMS, Certificate
 from lmdsl.errors import BadInput, shown
 from lmdsl.files import read_json
+from lmdsl.local_check import LocalCheck
 from lmdsl.lp import StabilizationLP
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem, parse_problem
 from lmdsl.result import ARRAYS, EXIT, Report, Result, Seconds, jsonable
 from lmdsl.sampling import control_count, control_vectors
 from lmdsl.systems import FunctionSystem
+from lmdsl.systems.base import NotStored
 
 FORMAT = "lmdsl-result/1"
 FILES = ("problem.json", "certificate.json", "solution.npz", "model.npz", "figures.png")
@@ -229,7 +231,7 @@ def load(path: str | os.PathLike[str]) -> Result:
     scalars = {
         key: stored[key]
         for key in Report.__dataclass_fields__
-        if key in stored and key not in ("seconds", "gamma_bar")
+        if key in stored and key not in ("seconds", "gamma_bar", "local_controller")
     }
     claims = stored["claims"]
     certificate = Certificate(
@@ -247,6 +249,7 @@ def load(path: str | os.PathLike[str]) -> Result:
     return Result(
         **known,
         gamma_bar=(float(bracket[0]), float(bracket[1])) if bracket else None,
+        local_controller=_local(stored.get("local_controller")),
         seconds=Seconds(**stored["seconds"]),
         problem=problem,
         partition=partition,
@@ -257,6 +260,23 @@ def load(path: str | os.PathLike[str]) -> Result:
         cause=stored["cause"],
         model_sha256=stored["model_sha256"],
     )
+
+
+def _local(stored: Any) -> LocalCheck | None:
+    """Read what a certificate says of the local controller; results before it say nothing."""
+    if stored is None:
+        return None
+    kinds: dict[str, Any] = {"kind": str, "cells": int, "samples": int, "kept": int}
+    kinds |= {"multiplier": _NUMBER, "proved": (int, type(None))}
+    sound = isinstance(stored, dict) and set(stored) == set(kinds)
+    if not sound or not all(
+        isinstance(stored[key], kind) and not isinstance(stored[key], bool)
+        for key, kind in kinds.items()
+    ):
+        raise BadInput("not what lmdsl writes", "certificate.json.local_controller")
+    if not _finite(stored["multiplier"]):
+        raise BadInput("multiplier is out of range", "certificate.json.local_controller")
+    return LocalCheck(**stored)
 
 
 def _problem(folder: Path) -> Problem:
@@ -271,7 +291,7 @@ def _problem(folder: Path) -> Problem:
 
 
 def _not_stored(**values: Any) -> Any:
-    raise BadInput("this result came from a Python function, which a directory does not hold")
+    raise NotStored("this result came from a Python function, which a directory does not hold")
 
 
 _NUMBER = (float, int, type(None))

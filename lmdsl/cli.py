@@ -126,6 +126,8 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("--starts", type=int, default=10_000, metavar="N")
     simulate.add_argument("--steps", type=int, default=10_000, metavar="T")
     simulate.add_argument("--seed", type=int, default=0, metavar="S")
+    simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
+                          help="with a local controller, steps after reaching A")  # fmt: skip
     as_json(simulate)
 
     plot = command("plot", _plot, "Draw the figures of a saved result.")
@@ -246,18 +248,11 @@ def _simulate(parsed: Arguments) -> int:
     result = Result.load(parsed.dir)
     with _Progress() as progress:
         progress("simulate", -1.0)
-        runs = result.simulate(parsed.starts, parsed.steps, parsed.seed)
+        runs = result.simulate(parsed.starts, parsed.steps, parsed.seed, parsed.hold)
     if parsed.json:
         _print_json(runs.to_dict())
         return 0
-    low, high = runs.interval
-    print(f"{runs.starts} runs of the true map from random starts")
-    print(f"  reached the attractor  {runs.reached}  ({100 * runs.reached / runs.starts:.4g} %; "
-          f"95 % interval {100 * low:.4g} to {100 * high:.4g} %)")  # fmt: skip
-    print(f"  lost                   {runs.lost}")
-    print(f"  cycling                {runs.cycling}")
-    if runs.steps:
-        print("  steps                  " + ", ".join(f"{k} {v}" for k, v in runs.steps.items()))
+    print(runs.text())
     return 0
 
 
@@ -426,6 +421,8 @@ def _summary(result: Any) -> str:
             ("contraction", number(result.contraction)),
             ("polish steps", str(result.polish_steps)),
         ]
+    if result.local_controller:
+        rows.append(("local", result.local_controller.sentence()))
     if result.gamma_bar:
         rows.append(("gamma_bar", "{:.9g} to {:.9g}".format(*result.gamma_bar)))
     stages = (("compile", seconds.compile), ("solve", seconds.solve), ("verify", seconds.verify))

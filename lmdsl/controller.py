@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from lmdsl.errors import BadInput, shown
 from lmdsl.graph import CellStatus
+from lmdsl.local import LocalController
 from lmdsl.partition import Partition
-from lmdsl.problem import Problem
+from lmdsl.problem import ConstantControl, Problem
 from lmdsl.sampling import noise_nodes
 
 Floats = NDArray[np.float64]
@@ -32,11 +33,14 @@ class Controller:
         Control vectors, shape (M, p).
     index
         Control index of every cell, shape (N,), -1 where there is none.
+    local
+        Feedback on the attractor cells, None without one.
     """
 
     partition: Partition
     vectors: Floats
     index: NDArray[np.int32]
+    local: LocalController | None = None
 
     def __call__(self, x: ArrayLike) -> Floats:
         """Return the control at states.
@@ -49,8 +53,8 @@ class Controller:
         Returns
         -------
         ndarray, shape (..., p)
-            NaN where there is no control: off the stabilizable set, outside the box, and on the
-            attractor cells.
+            NaN where there is no control: off the stabilizable set, outside the box, and, without
+            a local controller, on the attractor cells.
         """
         try:
             states = np.asarray(x, dtype=np.float64)
@@ -61,12 +65,43 @@ class Controller:
             raise BadInput(f"states have shape (..., {d}), not {states.shape}")
         flat = states.reshape(-1, d)
         cell = self.partition.locate(list(flat.T), clip=False)
-        return self.at(cell).reshape(*states.shape[:-1], self.vectors.shape[1])
+        return self.at(cell, flat).reshape(*states.shape[:-1], self.vectors.shape[1])
 
-    def at(self, cell: Indices) -> Floats:
-        """Return the control of cells, shape (len(cell), p); NaN for -1 and without control."""
+    def at(self, cell: Indices, x: Floats | None = None) -> Floats:
+        """Return the control of cells, shape (r, p); NaN for -1 and without control.
+
+        The local controller needs the states x, shape (r, d), and not only their cells.
+        """
         index = np.where(cell >= 0, self.index[cell], -1)
-        return np.where(index[:, None] >= 0, self.vectors[index], np.nan)
+        u = np.where(index[:, None] >= 0, self.vectors[index], np.nan)
+        if self.local is not None and x is not None:
+            inside = (cell >= 0) & self.local.attractor[cell]
+            u[inside] = self.local(x[inside], cell[inside])
+        return u
+
+
+@dataclass(frozen=True)
+class Held:
+    """What became of the runs that reached A, under local controller and controller together.
+
+    Attributes
+    ----------
+    steps
+        Steps each run went on after its first entry into A.
+    stayed, returned, away, lost
+        Runs that never left A; that left it and are back at the end; that are underway at the
+        end; that were lost.
+    distance
+        Median and largest distance from the orbit at the end, in cell widths, of the runs in A;
+        None where there is no orbit, or no run.
+    """
+
+    steps: int
+    stayed: int
+    returned: int
+    away: int
+    lost: int
+    distance: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
@@ -84,6 +119,8 @@ class Simulation:
         ``min``, ``q50``, ``q90``, ``q99``, ``max`` of the steps of the reached; None if none.
     interval
         95 % Clopper-Pearson interval of the share reached.
+    held
+        What became of the reached under the local controller; None without one.
     """
 
     starts: int
@@ -92,10 +129,43 @@ class Simulation:
     cycling: int
     steps: dict[str, int] | None
     interval: tuple[float, float]
+    held: Held | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        return {**asdict(self), "interval": list(self.interval)}
+        data = {**asdict(self), "interval": list(self.interval)}
+        if self.held is not None and self.held.distance is not None:
+            data["held"]["distance"] = list(self.held.distance)
+        return data
+
+    def text(self) -> str:
+        """Return a summary for people."""
+        low, high = self.interval
+        lines = [
+            f"{self.starts} runs of the true map from random starts",
+            f"  reached the attractor  {self.reached}  ({100 * self.reached / self.starts:.4g} %; "
+            f"95 % interval {100 * low:.4g} to {100 * high:.4g} %)",
+            f"  lost                   {self.lost}",
+            f"  cycling                {self.cycling}",
+        ]
+        if self.steps:
+            steps = ", ".join(f"{k} {v}" for k, v in self.steps.items())
+            lines.append(f"  steps                  {steps}")
+        if self.held:
+            held = self.held
+            lines += [
+                f"  then {held.steps} more steps under local controller and controller together",
+                f"    stayed in the attractor  {held.stayed}",
+                f"    left, and came back      {held.returned}",
+                f"    left, on the way back    {held.away}",
+                f"    left, and were lost      {held.lost}",
+            ]
+            if held.distance:
+                lines.append(
+                    f"    distance from the orbit  median {held.distance[0]:.3g}, "
+                    f"max {held.distance[1]:.3g} cell widths"
+                )
+        return "\n".join(lines)
 
 
 class ClosedLoop:
@@ -110,7 +180,7 @@ class ClosedLoop:
 
     def step(self, x: Floats, cell: Indices, rng: np.random.Generator) -> tuple[Floats, Indices]:
         """Return the next states, shape (r, d), and their cells, -1 outside the box."""
-        u = self.controller.at(cell)
+        u = self.controller.at(cell, x)
         values = {name: x[:, k] for k, name in enumerate(self.problem.states)}
         values |= {name: u[:, k] for k, name in enumerate(self.problem.controls)}
         if self.problem.noises:
@@ -129,8 +199,17 @@ class ClosedLoop:
 
     def run(
         self, x: Floats, steps: int, rng: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Run from states until A, loss, or the step limit; return outcome and steps per run."""
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+        """Run from states until A, loss, or the step limit.
+
+        Returns
+        -------
+        outcome, taken
+            Per run.
+        arrived
+            The states in which the runs that reached A entered it, in no particular order.
+        """
+        arrived = [x[:0]]
         cell = self.partition.locate(list(x.T))
         outcome = np.full(len(x), CYCLING, dtype=np.int64)
         taken = np.full(len(x), steps, dtype=np.int64)
@@ -143,12 +222,44 @@ class ClosedLoop:
             ):
                 outcome[active[ended]] = code
                 taken[active[ended]] = n
+                if code == REACHED:
+                    arrived.append(x[ended])
             on = state == CellStatus.STABILIZED
             active, x, cell = active[on], x[on], cell[on]
             if n == steps or not len(active):
                 break
             x, cell = self.step(x, cell, rng)
-        return outcome, taken
+        return outcome, taken, np.concatenate(arrived)
+
+    def hold(self, x: Floats, steps: int, rng: np.random.Generator) -> Held:
+        """Run on from states of A, under the local controller inside A and the other outside."""
+        local = self.controller.local
+        if local is None:
+            raise BadInput("the problem names no local controller", "local_controller")
+        cell, runs = self.partition.locate(list(x.T)), len(x)
+        stayed = np.ones(runs, dtype=np.bool_)
+        for _ in range(steps):
+            x, cell = self.step(x, cell, rng)
+            state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
+            on = state <= CellStatus.STABILIZED
+            stayed = (stayed & (state == CellStatus.ATTRACTOR))[on]
+            x, cell = x[on], cell[on]
+            if not len(x):
+                break
+        inside = self.status[cell] == CellStatus.ATTRACTOR
+        distance = None
+        constant = isinstance(self.problem.local_controller, ConstantControl)
+        if inside.any() and not constant:
+            away = local.distance(x[inside])
+            distance = (float(np.median(away)), float(away.max()))
+        return Held(
+            steps=steps,
+            stayed=int(stayed.sum()),
+            returned=int((inside & ~stayed).sum()),
+            away=int((~inside).sum()),
+            lost=runs - len(x),
+            distance=distance,
+        )
 
     def path(self, x: ArrayLike, steps: int, seed: int = 0) -> Floats:
         """Return the states of one run, shape (steps taken + 1, d), ending in A or with a loss."""
@@ -172,7 +283,13 @@ def draw_starts(
 
 
 def simulate(
-    loop: ClosedLoop, cells: Indices, weight: Floats, starts: int, steps: int, seed: int
+    loop: ClosedLoop,
+    cells: Indices,
+    weight: Floats,
+    starts: int,
+    steps: int,
+    seed: int,
+    hold: int,
 ) -> Simulation:
     """Simulate closed-loop runs from random starts.
 
@@ -184,12 +301,14 @@ def simulate(
         The cells of C and m on them; starts are drawn by m.
     starts, steps, seed
         Number of runs, step limit, seed of starts and noise.
+    hold
+        Steps to run on after the first entry into A, where there is a local controller.
     """
     rng = np.random.default_rng(seed)
     if not len(cells) or not weight.any():
         raise BadInput("there is no stabilizable cell to start from")
     x = draw_starts(loop.partition, cells, weight, starts, rng)
-    outcome, taken = loop.run(x, steps, rng)
+    outcome, taken, arrived = loop.run(x, steps, rng)
     reached = int((outcome == REACHED).sum())
     quantiles = None
     if reached:
@@ -202,6 +321,7 @@ def simulate(
         cycling=int((outcome == CYCLING).sum()),
         steps=quantiles,
         interval=clopper_pearson(reached, starts),
+        held=loop.hold(arrived, hold, rng) if loop.controller.local is not None else None,
     )
 
 

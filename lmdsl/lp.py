@@ -21,8 +21,10 @@ from lmdsl import graph
 from lmdsl.errors import BadInput
 from lmdsl.files import write_whole
 from lmdsl.graph import CellStatus, Predecessors
+from lmdsl.local import LocalController
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
+from lmdsl.regions import Regions
 from lmdsl.rows import Rows, freeze
 from lmdsl.sampling import control_vectors
 from lmdsl.transitions import Progress, assemble
@@ -249,6 +251,8 @@ def compile(problem: Problem, progress: Progress | None = None) -> Stabilization
         does not fit in memory.
     """
     partition = Partition.of(problem)
+    if problem.local_controller is not None:  # refuse a wrong one before the work
+        LocalController.of(problem, partition, Regions.of(problem, partition).attractor)
     transitions = assemble(problem, partition, progress)
     regions = transitions.regions
     found = graph.stabilizable(transitions.pair_pointer, transitions.rows)

@@ -19,10 +19,14 @@ from lmdsl.declarations import (
     Attractor,
     Avoid,
     Axis,
+    ConstantControl,
     ControlGrid,
     ControlRange,
     ControlValues,
     Grid,
+    LinearFeedback,
+    LocalUnion,
+    LqrFeedback,
     Measure,
     Noise,
     NoiseNormal,
@@ -44,9 +48,12 @@ __all__ = [
     "Attractor",
     "Avoid",
     "Axis",
+    "ConstantControl",
     "ControlRange",
     "ControlValues",
     "Grid",
+    "LinearFeedback",
+    "LqrFeedback",
     "Measure",
     "NoiseNormal",
     "NoiseValues",
@@ -78,6 +85,8 @@ class Problem(Declared):
         Sample points within a cell for Ulam's method.
     gamma
         Geometric weight of the cost, sum of gamma^n G(x_n, u_n).
+    local_controller
+        Feedback on the attractor cells, where the controller of the LP says nothing.
     noise, avoid, measure, on_exit, name
         Optional; see the problem format in the documentation.
 
@@ -100,11 +109,13 @@ class Problem(Declared):
     gamma: Positive = 1.0
     on_exit: Literal["forbid", "clip"] = "forbid"
     measure: Measure | None = None
+    local_controller: LocalUnion | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Problem:
         self._unique_names()
         self._axes_named()
+        self._local_named()
         self.step()
         self.cost()
         self.density()
@@ -162,17 +173,7 @@ class Problem(Declared):
                 owner[name] = kind
 
     def _axes_named(self) -> None:
-        for i, point in enumerate(self.attractor.points):
-            if isinstance(point, dict) and set(point) != set(self.states):
-                raise BadInput(
-                    f"a point names every axis once: {', '.join(self.states)}",
-                    f"attractor.points[{i}]",
-                )
-            if len(point) != len(self.states):
-                raise BadInput(
-                    f"{len(point)} coordinates for {len(self.states)} axes",
-                    f"attractor.points[{i}]",
-                )
+        self._points_named(self.attractor.points, "attractor.points")
         for i, cell in enumerate(self.attractor.cells):
             if len(cell) != len(self.states):
                 raise BadInput(
@@ -182,6 +183,46 @@ class Problem(Declared):
             part = getattr(self, where)
             for i, box in enumerate((part.boxes or ()) if part else ()):
                 self._box_named(box, f"{where}.boxes[{i}]")
+
+    def _points_named(self, points: Any, where: str) -> None:
+        for i, point in enumerate(points):
+            if isinstance(point, dict) and set(point) != set(self.states):
+                raise BadInput(
+                    f"a point names every axis once: {', '.join(self.states)}", f"{where}[{i}]"
+                )
+            if len(point) != len(self.states):
+                raise BadInput(
+                    f"{len(point)} coordinates for {len(self.states)} axes", f"{where}[{i}]"
+                )
+
+    def _local_named(self) -> None:
+        local, top = self.local_controller, "local_controller"
+        if local is None:
+            return
+        orbit = () if isinstance(local, ConstantControl) else local.orbit
+        self._points_named(orbit, f"{top}.orbit")
+        tables: list[tuple[str, Any, Any]] = [("control", local.control, self.controls)]
+        if isinstance(local, LqrFeedback):
+            tables.append(("state_weights", local.state_weights, self.states))
+            tables.append(("control_weights", local.control_weights, self.controls))
+        if isinstance(local, LinearFeedback):
+            tables.append(("gain", local.gain, self.controls))
+            tables += [(f"gain.{u}", row, self.states) for u, row in local.gain.items()]
+        for key, table, known in tables:
+            for name in table:
+                if name not in known:
+                    choice = f"one of {', '.join(known)}" if known else "nothing: there is none"
+                    raise BadInput(f"{shown(name)} is unknown; write {choice}", f"{top}.{key}")
+        along = {"control": local.control}
+        if isinstance(local, LinearFeedback):
+            along |= {f"gain.{u}": row for u, row in local.gain.items()}
+        for key, table in along.items():
+            for name, values in table.items():
+                if isinstance(values, tuple) and len(values) != len(orbit):
+                    raise BadInput(
+                        f"{len(values)} values for {len(orbit)} orbit points; give one each",
+                        f"{top}.{key}.{name}",
+                    )
 
     def _box_named(self, box: Mapping[str, tuple[float, float]], where: str) -> None:
         for name, (a, b) in box.items():
@@ -203,7 +244,9 @@ class Problem(Declared):
         if isinstance(self.system, FunctionSystem):
             raise BadInput("a FunctionSystem cannot be written to a file; use formulas", "system")
         data = self.model_dump(mode="json", exclude_none=True)
-        for key in ("system", "sampling"):
+        for key in ("system", "sampling", "local_controller"):
+            if key not in data:
+                continue
             data[key] = {"kind": data[key]["kind"], **data[key]}  # kind first, for people
         return data
 

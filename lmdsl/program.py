@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lmdsl.errors import BadInput
 from lmdsl.formulas import IN_PLACE, OPERATIONS, Formula, Step, fold
+from lmdsl.jets import Jet, apply
 
 
 class _Instruction(NamedTuple):
@@ -37,6 +38,8 @@ class Program:
         The names that a call must give values for.
     operations
         The operations of one call in order, for inspection.
+    effort
+        Their number, at least 1.
     """
 
     def __init__(self, formulas: Sequence[Formula], constants: Mapping[str, float] = {}) -> None:
@@ -59,6 +62,7 @@ class Program:
         self._instructions = self._with_lifetimes(instructions)
         self.names = frozenset(self._variables)
         self.operations = tuple(step.operation for step in instructions)
+        self.effort = max(len(instructions), 1)
 
     def _identify(
         self, step: Step, operands: Sequence[int], constants: Mapping[str, float]
@@ -123,6 +127,25 @@ class Program:
             results.append(result.copy() if slot in aliases else result)
             aliases.add(slot)
         return tuple(results)
+
+    def enclose(self, values: Mapping[str, Jet]) -> tuple[Jet, ...]:
+        """Enclose all formulas and their derivatives on boxes (see jets.py).
+
+        Parameters
+        ----------
+        values
+            A jet for each of `names`, all with the same number of directions.
+        """
+        directions = max((len(jet.slope.low) for jet in values.values()), default=0)
+        slots: list[Any] = [
+            None if value is None else Jet.constant(value, directions) for value in self._template
+        ]
+        for name, slot in self._variables.items():
+            slots[slot] = values[name]
+        with np.errstate(all="ignore"):
+            for step in self._instructions:
+                slots[step.target] = apply(step.operation, [slots[k] for k in step.operands])
+        return tuple(slots[slot] for slot in self._outputs)
 
 
 def _room(operands: list[Any], reusable: list[Any]) -> dict[str, Any]:

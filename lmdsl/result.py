@@ -15,9 +15,12 @@ from lmdsl.certificate import Certificate
 from lmdsl.controller import ClosedLoop, Controller, Simulation, simulate
 from lmdsl.errors import BadInput, shown
 from lmdsl.graph import CellStatus
+from lmdsl.local import LocalController
+from lmdsl.local_check import LocalCheck
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.regions import Regions
+from lmdsl.systems.base import NotStored
 
 if TYPE_CHECKING:
     import os
@@ -66,6 +69,8 @@ class Report:
         Wall-clock time per stage.
     message
         One sentence for people.
+    local_controller
+        Whether the problem's local controller keeps the attractor cells; None without one.
     """
 
     status: str
@@ -86,6 +91,7 @@ class Report:
     polish_steps: int | None = None
     seconds: Seconds = field(default_factory=Seconds)
     message: str = ""
+    local_controller: LocalCheck | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
@@ -99,7 +105,7 @@ class Report:
 
 def jsonable(value: Any) -> Any:
     """Return plain data that strict JSON can hold."""
-    if isinstance(value, Seconds):
+    if isinstance(value, Seconds | LocalCheck):
         return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, tuple | list):
         return [jsonable(v) for v in value]
@@ -190,8 +196,13 @@ class Result(Report):
 
     @cached_property
     def controller(self) -> Controller:
-        """The feedback law, ``u = result.controller(x)``."""
-        return Controller(self.partition, self.control_vectors, self.control_index)
+        """The feedback law, ``u = result.controller(x)``: the paper's C1, and C0 in A if any."""
+        attractor = self.cell_status == CellStatus.ATTRACTOR
+        try:
+            local = LocalController.of(self.problem, self.partition, attractor)
+        except NotStored:  # its linearisation needs the function; C1 does not
+            local = None
+        return Controller(self.partition, self.control_vectors, self.control_index, local)
 
     @cached_property
     def closed_loop(self) -> ClosedLoop:
@@ -239,15 +250,24 @@ class Result(Report):
             upper, lower = (math.fsum(weight[on] * x[on]) / mass for x in (self.value, self.lower))
         return CostFrom(upper * (1 + 1e-15), lower * (1 - 1e-15), mass)
 
-    def simulate(self, starts: int = 10_000, steps: int = 10_000, seed: int = 0) -> Simulation:
+    def simulate(
+        self, starts: int = 10_000, steps: int = 10_000, seed: int = 0, hold: int = 1_000
+    ) -> Simulation:
         """Run the true map under the controller from fresh random starts drawn by m.
+
+        Parameters
+        ----------
+        starts, steps, seed
+            Number of runs, step limit of each, seed of starts and noise.
+        hold
+            With a local controller, steps to run on after the first entry into A.
 
         Raises
         ------
         BadInput
             There is no controller, or a count is not positive.
         """
-        for name, count in (("starts", starts), ("steps", steps)):
+        for name, count in (("starts", starts), ("steps", steps), ("hold", hold)):
             if not isinstance(count, int | np.integer) or count < 1:
                 raise BadInput(f"{shown(count)} is not a whole number >= 1", name)
         if not isinstance(seed, int | np.integer) or seed < 0:
@@ -256,7 +276,7 @@ class Result(Report):
             raise BadInput("there is no controller to simulate: " + self.message)
         cells = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
         weight = self.weight[cells]
-        return simulate(self.closed_loop, cells, weight, starts, steps, seed)
+        return simulate(self.closed_loop, cells, weight, starts, steps, seed, hold)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as a directory that appears whole or not at all."""

@@ -15,6 +15,8 @@ from lmdsl.backends.scaled import failure
 from lmdsl.certificate import Certificate, Verified, Witness
 from lmdsl.errors import BadInput, shown
 from lmdsl.graph import CellStatus
+from lmdsl.local import LocalController
+from lmdsl.local_check import check
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.result import Result, Seconds
@@ -357,6 +359,8 @@ class _Job:
         if witness.pair is not None:
             index[lp.cells] = lp.control[witness.pair]
         solved = status != "not_stabilizable"
+        attractor = lp.cell_status == CellStatus.ATTRACTOR
+        local = LocalController.of(lp.problem, lp.partition, attractor)
         return Result(
             status=status,
             backend=self.backend,
@@ -369,8 +373,9 @@ class _Job:
             cells=lp.partition.size,
             controls=len(lp.controls),
             pairs=lp.K,
-            attractor_cells=int((lp.cell_status == CellStatus.ATTRACTOR).sum()),
+            attractor_cells=int(attractor.sum()),
             stabilizable_cells=n,
+            local_controller=None if local is None else check(lp.problem, local),
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
             message=message,
             problem=lp.problem,

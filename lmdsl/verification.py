@@ -21,6 +21,8 @@ from lmdsl.errors import BadInput
 from lmdsl.exact import check_exactly
 from lmdsl.gamma import restricted
 from lmdsl.graph import CellStatus
+from lmdsl.local import LocalController
+from lmdsl.local_check import check as check_local
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.regions import Regions
 from lmdsl.result import Result, jsonable
@@ -126,6 +128,7 @@ def verify(
         certificate = _judge_claims(lp, result, reasons, judge)
         if result.status != "verified":
             reasons.append(f"the status is {result.status}, not verified")
+    reasons += _judge_local(lp, result)
     return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
 
 
@@ -179,6 +182,28 @@ def _judge_claims(
     if result.gamma != lp.gamma:
         reasons.append(f"gamma is stored as {result.gamma!r}, but the problem says {lp.gamma!r}")
     return certificate
+
+
+def _judge_local(lp: StabilizationLP, result: Result) -> list[str]:
+    """Return where the local controller does less than the directory says."""
+    stored, problem = result.local_controller, result.problem
+    if stored is None or isinstance(problem.system, FunctionSystem):
+        return []
+    local = LocalController.of(problem, lp.partition, lp.cell_status == CellStatus.ATTRACTOR)
+    if local is None:
+        return ["a local controller is stored, but the problem names none"]
+    found = check_local(problem, local)
+    claims = [
+        ("multiplier", -(stored.multiplier or 0.0), -(found.multiplier or 0.0) * (1 - 1e-9)),
+        ("proved", stored.proved or 0, found.proved or 0),
+        ("kept", stored.kept, found.kept),
+    ]
+    return [
+        f"local_controller.{name} is stored as {getattr(stored, name)!r}, but is "
+        f"{getattr(found, name)!r}"
+        for name, claimed, proved in claims
+        if claimed > proved or (stored.cells, stored.samples) != (found.cells, found.samples)
+    ]
 
 
 def _judge_outside(lp: StabilizationLP, result: Result, reasons: list[str]) -> None:

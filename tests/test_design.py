@@ -19,6 +19,8 @@ ORDER = """
 errors
 files
 formulas
+intervals
+jets
 program
 declared
 systems.base
@@ -29,6 +31,8 @@ problem
 sampling memory
 partition rows
 regions
+local
+local_check
 transitions
 graph
 lp

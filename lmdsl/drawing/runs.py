@@ -147,7 +147,7 @@ def closed_loop(
             break
         here, state = points[-1][on], cell[on]
         following, cell[on] = loop.step(here, state, rng)
-        u = loop.controller.at(state)
+        u = loop.controller.at(state, here)
         for _ in range(PIECES - 1 if inner else 0):
             here = inner(here, u) if inner else here
             points.append(_scatter(x, on, into_box(p, here)))

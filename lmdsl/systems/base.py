@@ -19,6 +19,7 @@ from pydantic import Field, model_validator
 from lmdsl.declared import Count, Declared, Formulas, Number, Parameters
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, parse
+from lmdsl.jets import Jet
 from lmdsl.program import Program
 
 Array = NDArray[np.float64]
@@ -126,29 +127,42 @@ class OdeSystem(System):
 class _RungeKutta:
     """x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4), repeated; h = step / substeps."""
 
-    def __init__(self, field: Step, states: tuple[str, ...], step: float, substeps: int) -> None:
+    def __init__(self, field: Program, states: tuple[str, ...], step: float, substeps: int) -> None:
         self.field, self.states = field, states
         self.substeps, self.h = substeps, step / substeps
+        self.effort = substeps * (4 * field.effort + 14 * len(states))
 
     def __call__(self, values: Mapping[str, Any]) -> tuple[Array, ...]:
-        held = dict(values)
-        state: tuple[Array, ...] = tuple(np.asarray(held[name], float) for name in self.states)
-        h = self.h
-
-        def slope(at: Sequence[Array]) -> tuple[Array, ...]:
-            held.update(zip(self.states, at, strict=True))
-            return self.field(held)
-
+        start = tuple(np.asarray(values[name], float) for name in self.states)
         with np.errstate(all="ignore"):
-            for _ in range(self.substeps):
-                k1 = slope(state)
-                k2 = slope([x + (h / 2) * k for x, k in zip(state, k1, strict=True)])
-                k3 = slope([x + (h / 2) * k for x, k in zip(state, k2, strict=True)])
-                k4 = slope([x + h * k for x, k in zip(state, k3, strict=True)])
-                state = tuple(
-                    x + (h / 6) * (a + 2 * b + 2 * c + d)
-                    for x, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
-                )
+            images: tuple[Array, ...] = self._advance(values, start, self.field)
+        return images
+
+    def enclose(self, values: Mapping[str, Jet]) -> tuple[Jet, ...]:
+        """Enclose the images and their derivatives on boxes."""
+        start = tuple(values[name] for name in self.states)
+        with np.errstate(all="ignore"):
+            images: tuple[Jet, ...] = self._advance(values, start, self.field.enclose)
+        return images
+
+    def _advance(self, values: Mapping[str, Any], state: tuple[Any, ...], field: Any) -> Any:
+        """Step arrays or jets: the arithmetic is the same."""
+        held, h = dict(values), self.h
+
+        def slope(at: Sequence[Any]) -> tuple[Any, ...]:
+            held.update(zip(self.states, at, strict=True))
+            image: tuple[Any, ...] = field(held)
+            return image
+
+        for _ in range(self.substeps):
+            k1 = slope(state)
+            k2 = slope([x + (h / 2) * k for x, k in zip(state, k1, strict=True)])
+            k3 = slope([x + (h / 2) * k for x, k in zip(state, k2, strict=True)])
+            k4 = slope([x + h * k for x, k in zip(state, k3, strict=True)])
+            state = tuple(
+                x + (h / 6) * (a + 2 * b + 2 * c + d)
+                for x, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
+            )
         return state
 
 
@@ -240,6 +254,10 @@ class NamedOde(NamedSystem):
             step=self.step,
             substeps=self.substeps,
         )
+
+
+class NotStored(BadInput):
+    """A Python function was called of which only a saved result is at hand."""
 
 
 class FunctionSystem(System):

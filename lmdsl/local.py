@@ -1,0 +1,292 @@
+"""The local controller C0: feedback on the attractor cells.
+
+The controller of the LP, C1, brings every cell to the attractor A and says nothing inside. C0 is
+constant, linear or LQR feedback around a fixed point or a periodic orbit x_0, x_1, ...; each
+attractor cell belongs to the orbit point nearest to its centre. Controls are clipped to the range
+of the control grid. Together they are the paper's feedback: C0 near the attractor, C1 outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.declarations import ConstantControl, LinearFeedback, LqrFeedback
+from lmdsl.errors import BadInput
+from lmdsl.intervals import Interval
+from lmdsl.jets import Jet
+from lmdsl.partition import Partition
+from lmdsl.problem import Problem
+from lmdsl.sampling import Nodes, control_values, noise_nodes
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+MAX_RICCATI = 256  # states of the Riccati equation: orbit points times axes
+ON_ORBIT = 1e-3  # cell widths by which a point may miss its successor
+
+
+@dataclass(frozen=True)
+class LocalController:
+    """u = clip(u_k - K_k (x - x_k)), k the orbit point that owns the cell of x.
+
+    Attributes
+    ----------
+    partition, attractor
+        The cells, and which of them it controls, shape (N,).
+    orbit
+        Shape (q, d): the points x_k; the centre of the box for constant control.
+    control
+        Shape (q, p): the controls u_k along the orbit.
+    gain
+        Shape (q, p, d): the feedback matrices K_k.
+    low, high
+        Shape (p,): the range of the control grid, to which controls are clipped.
+    multiplier
+        Largest modulus of the multipliers of the linearised orbit under feedback (eigenvalues of
+        the product of A_k - B_k K_k): below 1, the orbit attracts what is near. None for constant
+        control, which names no orbit, and where the system is not differentiable.
+    """
+
+    partition: Partition
+    attractor: NDArray[np.bool_]
+    orbit: Floats
+    control: Floats
+    gain: Floats
+    low: Floats
+    high: Floats
+    multiplier: float | None
+
+    @classmethod
+    def of(
+        cls, problem: Problem, partition: Partition, attractor: NDArray[np.bool_]
+    ) -> LocalController | None:
+        """Return the local controller of a problem, None where it names none.
+
+        Raises
+        ------
+        BadInput
+            The points are no orbit, lie outside the attractor, a control lies outside its range,
+            or the Riccati equation has no stabilizing solution.
+        """
+        declared = problem.local_controller
+        if declared is None:
+            return None
+        values = control_values(problem)
+        low, high = (np.array([f(v) for v in values]) for f in (np.min, np.max))
+        where = "local_controller"
+        p, d = len(values), partition.dimension
+        if isinstance(declared, ConstantControl):
+            control = np.array([[declared.control.get(name, 0.0) for name in problem.controls]])
+            _within(control, low, high, problem.controls, where)
+            centre = (partition.low + partition.high)[None, :] / 2
+            gain = np.zeros((1, p, d))
+            return cls(partition, attractor, centre, control.reshape(1, p), gain, low, high, None)
+        orbit = np.array(
+            [
+                [point[name] for name in partition.names] if isinstance(point, dict) else point
+                for point in declared.orbit
+            ]
+        )
+        q = len(orbit)
+        control = np.zeros((q, p))
+        for j, name in enumerate(problem.controls):
+            control[:, j] = declared.control.get(name, 0.0)
+        _within(control, low, high, problem.controls, where)
+        _inside(orbit, partition, attractor)
+        mean = _mean_noise(noise_nodes(problem))
+        _refuse_unless_orbit(problem, partition, orbit, control, mean)
+        jacobian = _jacobian(problem, orbit, control, mean)
+        A, B = jacobian[:, :, :d], jacobian[:, :, d:]
+        smooth = bool(np.isfinite(jacobian).all())
+        if isinstance(declared, LinearFeedback):
+            gain = np.zeros((q, p, d))
+            for j, u in enumerate(problem.controls):
+                for i, x in enumerate(partition.names):
+                    gain[:, j, i] = declared.gain.get(u, {}).get(x, 0.0)
+        elif not smooth:
+            raise BadInput("the system is not differentiable there", "local_controller.orbit")
+        else:
+            gain = _regulator(A, B, *_weights(declared, problem, partition, values, control))
+        multiplier = None
+        if smooth:
+            product = np.eye(d)
+            for k in range(q):
+                product = (A[k] - B[k] @ gain[k]) @ product
+            multiplier = float(np.abs(np.linalg.eigvals(product)).max())
+        return cls(partition, attractor, orbit, control, gain, low, high, multiplier)
+
+    def owner(self, cell: Indices) -> Indices:
+        """Return the index of the orbit point nearest to the centre of each cell."""
+        if len(self.orbit) == 1:
+            return np.zeros(len(cell), dtype=np.int64)
+        away = self.deviation(self.partition.centres(cell)[:, None, :], self.orbit[None, :, :])
+        nearest: Indices = np.argmin(((away / self.partition.width) ** 2).sum(axis=-1), axis=-1)
+        return nearest
+
+    def deviation(self, x: Floats, point: Floats) -> Floats:
+        """Return x - point, on periodic axes the shortest way round."""
+        away = x - point
+        span = self.partition.high - self.partition.low
+        turns = np.where(self.partition.periodic, np.round(away / span), 0.0)
+        return np.asarray(away - turns * span)
+
+    def __call__(self, x: Floats, cell: Indices) -> Floats:
+        """Return the control at states x, shape (r, d), of given attractor cells, shape (r, p)."""
+        k = self.owner(cell)
+        # By way of the cell's centre: on a circle the law then has no jump inside a cell.
+        centre = self.partition.centres(cell)
+        away = self.deviation(x, centre) + self.deviation(centre, self.orbit[k])
+        u = self.control[k] - np.einsum("rpd,rd->rp", self.gain[k], away)
+        return np.asarray(np.clip(u, self.low, self.high))
+
+    def distance(self, x: Floats) -> Floats:
+        """Return the distance from the orbit in cell widths (largest axis), shape (r,)."""
+        away = self.deviation(x[:, None, :], self.orbit[None, :, :])
+        return np.asarray(np.abs(away / self.partition.width).max(axis=-1).min(axis=-1))
+
+
+def _within(control: Floats, low: Floats, high: Floats, names: tuple[str, ...], where: str) -> None:
+    for j, name in enumerate(names):
+        for u in control[:, j]:
+            if not low[j] <= u <= high[j]:
+                raise BadInput(
+                    f"{float(u)!r} is outside the control grid "
+                    f"[{float(low[j])!r}, {float(high[j])!r}]",
+                    f"{where}.control.{name}",
+                )
+
+
+def _inside(orbit: Floats, partition: Partition, attractor: NDArray[np.bool_]) -> None:
+    for k, point in enumerate(orbit):
+        where = f"local_controller.orbit[{k}]"
+        block = partition.around_point([float(x) for x in point], where)
+        if not attractor[partition.mask([block])].any():
+            raise BadInput("the point lies in no attractor cell; add it to the attractor", where)
+
+
+def _mean_noise(nodes: Nodes) -> Floats:
+    mean: Floats = nodes.weights @ nodes.values / nodes.weights.sum()
+    return mean
+
+
+def _refuse_unless_orbit(
+    problem: Problem, partition: Partition, orbit: Floats, control: Floats, noise: Floats
+) -> None:
+    q = len(orbit)
+    values = {name: orbit[:, k] for k, name in enumerate(problem.states)}
+    values |= {name: control[:, j] for j, name in enumerate(problem.controls)}
+    values |= {name: np.full(q, noise[j]) for j, name in enumerate(problem.noises)}
+    images = np.stack([np.broadcast_to(y, q) for y in problem.step()(values)], axis=-1)
+    miss = images - np.roll(orbit, -1, axis=0)
+    span = partition.high - partition.low
+    with np.errstate(invalid="ignore"):
+        miss -= np.where(partition.periodic, np.round(miss / span), 0.0) * span
+    off = np.abs(miss / partition.width).max(axis=1)
+    for k in range(q):
+        if not off[k] <= ON_ORBIT:
+            raise BadInput(
+                f"point {k} is mapped to {[float(y) for y in images[k]]}, {off[k]:.3g} cell widths "
+                "from the next point; give the orbit more precisely, in the order visited, with "
+                "its controls",
+                "local_controller.orbit",
+            )
+
+
+def _jacobian(problem: Problem, orbit: Floats, control: Floats, noise: Floats) -> Floats:
+    """Return the derivatives by states and controls, shape (q, d, d + p); NaN at a kink."""
+    step, q = problem.step(), len(orbit)
+    names = (*problem.states, *problem.controls)
+    at = np.concatenate([orbit, control], axis=1)
+    fixed = {name: np.full(q, noise[j]) for j, name in enumerate(problem.noises)}
+    if not hasattr(step, "enclose"):
+        return np.moveaxis(_differences(step, names, at, fixed), 2, 0)
+    jets = {
+        name: Jet.variable(Interval.point(at[:, j]), j, len(names)) for j, name in enumerate(names)
+    }
+    jets |= {name: Jet.constant(x, len(names)) for name, x in fixed.items()}
+    slopes = []
+    with np.errstate(invalid="ignore"):
+        for image in step.enclose(jets):
+            low, high = (np.broadcast_to(end, (len(names), q)) for end in image.slope)
+            sharp = np.isfinite(low) & (high - low <= 1e-6 * (1 + np.abs(low)))
+            slopes.append(np.where(sharp, image.slope.midpoint, np.nan))
+    return np.moveaxis(np.stack(slopes), 2, 0)
+
+
+def _differences(step: Any, names: tuple[str, ...], at: Floats, fixed: dict[str, Floats]) -> Floats:
+    """Differentiate a Python function by central differences with Richardson's extrapolation."""
+    q = len(at)
+
+    def central(j: int, h: float) -> Floats:
+        images = []
+        for sign in (1.0, -1.0):
+            values = {
+                name: at[:, i] + (sign * h if i == j else 0.0) for i, name in enumerate(names)
+            }
+            images.append(np.stack([np.broadcast_to(y, q) for y in step({**values, **fixed})]))
+        return np.asarray((images[0] - images[1]) / (2 * h))
+
+    columns = []
+    for j in range(len(names)):
+        h = 1e-4 * max(1.0, float(np.abs(at[:, j]).max()))
+        columns.append((4 * central(j, h / 2) - central(j, h)) / 3)
+    return np.moveaxis(np.stack(columns), 1, 0)  # (d, d + p, q)
+
+
+def _weights(
+    declared: LqrFeedback,
+    problem: Problem,
+    partition: Partition,
+    values: list[Floats],
+    control: Floats,
+) -> tuple[Floats, Floats]:
+    Q = [
+        declared.state_weights.get(name, 1.0 / float(partition.width[i]) ** 2)
+        for i, name in enumerate(partition.names)
+    ]
+    R = []
+    for j, name in enumerate(problem.controls):
+        reach = float(np.abs(values[j][:, None] - control[None, :, j]).max()) or 1.0
+        R.append(declared.control_weights.get(name, 1.0 / reach**2))
+    return np.array(Q), np.array(R)
+
+
+def _regulator(A: Floats, B: Floats, Q: Floats, R: Floats) -> Floats:
+    """Solve the periodic LQR problem as one Riccati equation in cyclic form.
+
+    The state of the cyclic system holds one block per orbit point; block k moves to block k + 1
+    by A_k, B_k. Its stabilizing solution is block diagonal with the periodic solution X_k (Bittanti
+    and Colaneri, Periodic Systems, 2009), and K_k = (R + B_k' X_{k+1} B_k)^-1 B_k' X_{k+1} A_k.
+    """
+    from scipy.linalg import solve, solve_discrete_are
+
+    q, d, p = B.shape
+    where = "local_controller"
+    if q * d > MAX_RICCATI:
+        raise BadInput(f"{q} points of {d} axes; at most {MAX_RICCATI} in all", f"{where}.orbit")
+    if not p:
+        return np.zeros((q, 0, d))
+    cyclic_A, cyclic_B = np.zeros((q * d, q * d)), np.zeros((q * d, q * p))
+    for k in range(q):
+        after = (k + 1) % q
+        rows = slice(after * d, (after + 1) * d)
+        cyclic_A[rows, k * d : (k + 1) * d] = A[k]
+        cyclic_B[rows, k * p : (k + 1) * p] = B[k]
+    try:
+        X = solve_discrete_are(cyclic_A, cyclic_B, np.diag(np.tile(Q, q)), np.diag(np.tile(R, q)))
+        gains = []
+        for k in range(q):
+            after = (k + 1) % q
+            Xk = X[after * d : (after + 1) * d, after * d : (after + 1) * d]
+            gains.append(solve(np.diag(R) + B[k].T @ Xk @ B[k], B[k].T @ Xk @ A[k], assume_a="pos"))
+    except (np.linalg.LinAlgError, ValueError):
+        raise BadInput(
+            "the controls cannot stabilize the linearisation along the orbit (the Riccati equation "
+            "has no stabilizing solution); choose another orbit, weights or kind",
+            where,
+        ) from None
+    return np.stack(gains)

@@ -1,0 +1,250 @@
+"""Whether the local controller keeps the attractor cells: by samples, and by enclosure.
+
+To prove T(x, C0(x), w) in A for every x of a cell, the cell is cut into boxes until the enclosed
+image of each (jets.py) meets attractor cells only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.intervals import Interval, add, intersection, multiply, subtract
+from lmdsl.jets import Jet, apply
+from lmdsl.local import LocalController
+from lmdsl.partition import EDGE, Partition
+from lmdsl.problem import Problem
+from lmdsl.sampling import noise_nodes
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SAMPLES = 10_000
+CHUNK = 8192  # cells enclosed at a time
+WORK = 2e7  # most operations on boxes that an enclosure may take: some seconds
+OVERHEAD = 1000  # boxes whose arithmetic costs as much as NumPy's own work for an operation
+ROUNDS = 14  # most halvings of an axis
+MEETS = 512  # most cells that the image of a box may meet
+
+
+@dataclass(frozen=True)
+class LocalCheck:
+    """Whether the local controller keeps the attractor cells: T(x, C0(x), w) in A for x in A.
+
+    Attributes
+    ----------
+    kind
+        ``constant``, ``linear`` or ``lqr``.
+    multiplier
+        Largest modulus of the multipliers of the linearised orbit; below 1 it attracts.
+    cells
+        Number of attractor cells.
+    proved
+        Of these, cells whose every point is mapped into A: enclosed by interval arithmetic. None
+        for a system written in Python, which cannot be enclosed.
+    samples, kept
+        Random states of A, and how many of them are mapped into A by every noise node.
+    """
+
+    kind: str
+    multiplier: float | None
+    cells: int
+    proved: int | None
+    samples: int
+    kept: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        return asdict(self)
+
+    def sentence(self) -> str:
+        """Return one line for people."""
+        line = f"{self.kind}: "
+        if self.proved is not None:
+            line += f"keeps {self.proved} of {self.cells} attractor cells (proved); "
+        line += f"keeps {self.kept} of {self.samples} random states of A"
+        if self.multiplier is not None:
+            line += f"; orbit's multiplier {self.multiplier:.4g}"
+        return line
+
+
+def check(problem: Problem, local: LocalController) -> LocalCheck:
+    """Check whether the local controller of a problem keeps the attractor cells."""
+    cells = np.flatnonzero(local.attractor)
+    return LocalCheck(
+        kind="constant" if problem.local_controller is None else problem.local_controller.kind,
+        multiplier=local.multiplier,
+        cells=len(cells),
+        proved=_proved(problem, local, cells),
+        samples=SAMPLES,
+        kept=_sampled(problem, local, cells),
+    )
+
+
+def _sampled(problem: Problem, local: LocalController, cells: Indices) -> int:
+    rng = np.random.default_rng(0)
+    cell = cells[rng.integers(len(cells), size=SAMPLES)]
+    partition = local.partition
+    index = np.stack(partition.multi_index(cell), axis=-1)
+    x = partition.low + (index + rng.random(index.shape)) * partition.width
+    return int(_stays(problem, local, x, cell).sum())
+
+
+def _stays(problem: Problem, local: LocalController, x: Floats, cell: Indices) -> NDArray[np.bool_]:
+    """Return which states of attractor cells are mapped into A by every noise node."""
+    u = local(x, cell)
+    values = {name: x[:, k] for k, name in enumerate(problem.states)}
+    values |= {name: u[:, k] for k, name in enumerate(problem.controls)}
+    step, stays = problem.step(), np.ones(len(x), dtype=np.bool_)
+    for node in noise_nodes(problem).values:
+        noise = {name: np.full(len(x), node[j]) for j, name in enumerate(problem.noises)}
+        images = [np.broadcast_to(y, len(x)) for y in step({**values, **noise})]
+        target = local.partition.locate(images)
+        stays &= (target >= 0) & local.attractor[target]
+    return stays
+
+
+def _proved(problem: Problem, local: LocalController, cells: Indices) -> int | None:
+    """Count the cells that are mapped into A as a whole; None where no formula allows it.
+
+    Cells that are still undecided when the work is used up count as not proved.
+    """
+    step = problem.step()
+    if not hasattr(step, "enclose"):
+        return None
+    nodes = noise_nodes(problem).values
+    per_box = float(step.effort) * len(nodes) * (1 + local.partition.dimension)
+    proved, work = 0, WORK
+    for start in range(0, len(cells), CHUNK):
+        kept, spent = _kept(problem, local, cells[start : start + CHUNK], nodes, work / per_box)
+        proved += kept
+        work -= spent * per_box
+        if work <= 0:
+            break
+    return proved
+
+
+def _kept(
+    problem: Problem, local: LocalController, cells: Indices, nodes: Floats, limit: float
+) -> tuple[int, float]:
+    """Return how many of some cells are proved, and the work in boxes.
+
+    A box whose image is not enclosed in A is halved along its longest side (in cell widths),
+    unless its centre is mapped outside: then its cell is lost.
+    """
+    step, partition = problem.step(), local.partition
+    index = np.stack(partition.multi_index(cells), axis=-1)
+    # Points this close to an edge may count as the cell's own.
+    slack = 2 * EDGE * partition.width
+    low = partition.low + index * partition.width - slack
+    high = partition.low + (index + 1) * partition.width + slack
+    home, work = np.arange(len(cells)), 0.0
+    lost = np.zeros(len(cells), dtype=np.bool_)
+    for _ in range(ROUNDS * partition.dimension):
+        work += len(home) + OVERHEAD
+        if not len(home) or work > limit:
+            break
+        inside = np.ones(len(home), dtype=np.bool_)
+        with np.errstate(all="ignore"):
+            for node in nodes:
+                images = _images(problem, local, step, cells[home], low, high, node)
+                inside &= _into(partition, local.attractor, images)
+        centre = low / 2 + high / 2
+        lost[home[~_stays(problem, local, centre, cells[home])]] = True
+        open_ = ~inside & ~lost[home]
+        low, high, home = low[open_], high[open_], home[open_]
+        axis = np.argmax((high - low) / partition.width, axis=1)
+        rows = np.arange(len(home))
+        upper, lower = low.copy(), high.copy()
+        upper[rows, axis] = lower[rows, axis] = (low[rows, axis] + high[rows, axis]) / 2
+        low, high = np.concatenate([low, upper]), np.concatenate([lower, high])
+        home = np.concatenate([home, home])
+    lost[home] = True
+    return int((~lost).sum()), work
+
+
+def _images(
+    problem: Problem,
+    local: LocalController,
+    step: Any,
+    cell: Indices,
+    low: Floats,
+    high: Floats,
+    noise: Floats,
+) -> list[Interval]:
+    """Enclose T(x, C0(x), w) on boxes: the range itself and the mean value form, intersected."""
+    centre = low / 2 + high / 2
+    box = Interval(low, high)
+    images = _closed(problem, local, step, cell, box, noise)
+    middle = _closed(problem, local, step, cell, Interval.point(centre), noise)
+    away = subtract(box, Interval.point(centre))
+    enclosed = []
+    for image, at in zip(images, middle, strict=True):
+        mean = at.value
+        for k in range(local.partition.dimension):
+            slope = Interval(image.slope.low[k], image.slope.high[k])
+            mean = add(mean, multiply(slope, Interval(away.low[:, k], away.high[:, k])))
+        enclosed.append(intersection(image.value, mean))
+    return enclosed
+
+
+def _closed(
+    problem: Problem, local: LocalController, step: Any, cell: Indices, box: Interval, noise: Floats
+) -> tuple[Jet, ...]:
+    """Return jets of the closed loop, derivatives with respect to the states."""
+    d = local.partition.dimension
+    k = local.owner(cell)
+    x = [Jet.variable(Interval(box.low[:, i], box.high[:, i]), i, d) for i in range(d)]
+    values = dict(zip(problem.states, x, strict=True))
+    centre = local.partition.centres(cell)
+    origin = centre - local.deviation(centre, local.orbit[k])  # x_k, turned near to the cell
+    for j, name in enumerate(problem.controls):
+        u = Jet.constant(local.control[k, j], d)
+        for i in range(d):
+            u = u - Jet.constant(local.gain[k, j, i], d) * (x[i] - Jet.constant(origin[:, i], d))
+        u = apply("max", [u, Jet.constant(local.low[j], d)])
+        values[name] = apply("min", [u, Jet.constant(local.high[j], d)])
+    for j, name in enumerate(problem.noises):
+        values[name] = Jet.constant(noise[j], d)
+    images: tuple[Jet, ...] = step.enclose(values)
+    return images
+
+
+def _into(
+    partition: Partition, attractor: NDArray[np.bool_], images: list[Interval]
+) -> NDArray[np.bool_]:
+    """Return which image boxes lie in the attractor: every cell that they may meet is one."""
+    count = np.broadcast_shapes(*(np.shape(end) for image in images for end in image))[0]
+    sure = np.ones(count, dtype=np.bool_)
+    first = np.zeros((len(images), count), dtype=np.int64)
+    size = np.ones((len(images), count), dtype=np.int64)
+    for k, image in enumerate(images):
+        low, high = (np.broadcast_to(end, count) for end in image)
+        n, a, h = int(partition.cells[k]), partition.low[k], partition.width[k]
+        bounded = not partition.periodic[k]
+        sure &= np.isfinite(low) & np.isfinite(high)
+        if bounded and partition.clip:
+            low, high = (np.clip(end, a, partition.high[k]) for end in (low, high))
+        t_low, t_high = (low - a) / h, (high - a) / h
+        sure &= (np.abs(t_low) < 2**30) & (np.abs(t_high) < 2**30)
+        sure &= t_high - t_low < MEETS
+        if bounded:
+            sure &= (t_low >= 0) & (t_high <= n)
+        # Either neighbour of an edge may be the cell that locate decides for.
+        down = np.floor(np.where(sure, t_low, 0.0) - 2 * EDGE)
+        up = np.floor(np.where(sure, t_high, 0.0) + 2 * EDGE)
+        if bounded:
+            down, up = np.maximum(down, 0), np.minimum(up, n - 1)
+        first[k], size[k] = down, up - down + 1
+    cells = np.prod(size.astype(np.float64), axis=0)
+    sure &= cells <= MEETS
+    for number in range(int(cells[sure].max(initial=0))):
+        rest, cell = np.full(count, number), np.zeros(count, dtype=np.int64)
+        for k in range(len(images)):  # the number-th cell of each image; beyond its last, repeats
+            rest, step = np.divmod(rest, size[k])
+            cell = cell * int(partition.cells[k]) + (first[k] + step) % int(partition.cells[k])
+        sure &= attractor[cell]
+    return sure

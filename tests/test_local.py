@@ -1,0 +1,339 @@
+"""Local controllers: the regulator, the whole feedback, and what is proved of it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from problems import doubling, made, standard_map, steps
+
+import lmdsl as lm
+from lmdsl.local import LocalController
+from lmdsl.local_check import check
+from lmdsl.partition import Partition
+from lmdsl.regions import Regions
+
+ORBIT = [{"x": 0.25, "y": 0.5}, {"x": 0.75, "y": 0.5}]
+
+
+def local_of(problem):
+    partition = Partition.of(problem)
+    return LocalController.of(problem, partition, Regions.of(problem, partition).attractor)
+
+
+def linear_system(A, B, cells=8, **more):
+    """x+ = A x + B u on [-1, 1]^d, A the cells around the origin."""
+    d, p = np.shape(B)
+    names = [f"x{i}" for i in range(d)]
+    controls = [f"u{j}" for j in range(p)]
+    terms = [
+        [f"({A[i][k]!r})*{names[k]}" for k in range(d)]
+        + [f"({B[i][j]!r})*{controls[j]}" for j in range(p)]
+        for i in range(d)
+    ]
+    return {
+        "format": "lmdsl/1",
+        "system": {
+            "kind": "map",
+            "next": {n: " + ".join(t) for n, t in zip(names, terms, strict=True)},
+        },
+        "state_box": {n: {"low": -1, "high": 1, "cells": cells} for n in names},
+        "attractor": {"points": [[0.0] * d]},
+        "control_grid": {u: {"low": -1, "high": 1, "points": 3} for u in controls},
+        "stage_cost": "1",
+        "sampling": {"kind": "grid", "per_axis": 2},
+        **more,
+    }
+
+
+def test_the_regulator_of_a_fixed_point_solves_its_riccati_equation():
+    A, B = [[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]]
+    weights = {"state_weights": {"x0": 2.0, "x1": 0.5}, "control_weights": {"u0": 3.0}}
+    data = linear_system(A, B, local_controller={"kind": "lqr", "orbit": [[0, 0]], **weights})
+    local = local_of(made(data))
+    # Value iteration of the Riccati recursion, an independent route to the same gain.
+    A, B, Q, R = np.array(A), np.array(B), np.diag([2.0, 0.5]), np.array([[3.0]])
+    X = Q
+    for _ in range(5000):
+        K = np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A)
+        X = Q + A.T @ X @ (A - B @ K)
+    np.testing.assert_allclose(local.gain[0], K, rtol=1e-9)
+    assert local.multiplier == pytest.approx(np.abs(np.linalg.eigvals(A - B @ K)).max())
+    x = np.array([[0.05, -0.1]])
+    np.testing.assert_allclose(local(x, np.array([27])), np.clip(-x @ K.T, -1, 1), rtol=1e-9)
+
+
+def test_the_regulator_of_a_periodic_orbit_solves_the_periodic_recursion():
+    data = standard_map(50, local_controller={"kind": "lqr", "orbit": ORBIT})
+    local = local_of(made(data))
+    Q, R = np.diag([2500.0, 2500.0]), np.array([[4.0]])
+    A = np.array([[1.0, 1.0], [0.0, 1.0]])
+    B = [0.25 * s * np.ones((2, 1)) for s in (1.0, -1.0)]
+    X = [Q, Q]
+    for _ in range(2000):
+        for k in (1, 0):
+            after = X[(k + 1) % 2]
+            K = np.linalg.solve(R + B[k].T @ after @ B[k], B[k].T @ after @ A)
+            X[k] = Q + A.T @ after @ (A - B[k] @ K)
+            np.testing.assert_array_equal(K.shape, (1, 2))
+            if k == 0:
+                K0 = K
+            else:
+                K1 = K
+    np.testing.assert_allclose(local.gain, [K0, K1], rtol=1e-9)
+    np.testing.assert_allclose(K0, -K1)  # the symmetry of the map
+
+
+def test_the_orbit_of_the_standard_map_is_held_and_u_0_does_not_hold_it():
+    held = lm.solve(made(standard_map(50, local_controller={"kind": "lqr", "orbit": ORBIT})))
+    assert held.local_controller.proved == held.local_controller.cells == 4
+    assert held.local_controller.kept == held.local_controller.samples
+    assert held.local_controller.multiplier < 0.2
+    runs = held.simulate(starts=500, hold=300)
+    assert runs.reached == runs.held.stayed == 500
+    assert runs.held.distance[1] < 1e-9
+    drifting = lm.solve(made(standard_map(50, local_controller={"kind": "constant"})))
+    assert drifting.local_controller.proved == 0
+    assert drifting.local_controller.kept < 6000
+    after = drifting.simulate(starts=500, hold=300).held
+    assert after.stayed < 25
+    assert after.returned + after.away > 475  # the other controller brings it back, again and again
+    assert (after.lost, after.distance) == (0, None)
+    assert held.cost == drifting.cost  # C1 knows nothing of C0
+    np.testing.assert_array_equal(held.control_index, drifting.control_index)
+
+
+def test_the_whole_feedback():
+    result = lm.solve(made(standard_map(50, local_controller={"kind": "lqr", "orbit": ORBIT})))
+    K = result.controller.local.gain
+    x = np.array([[0.255, 0.49], [0.75, 0.51], [1.255, -0.51], [0.1, 0.1]])
+    u = result.controller(x)
+    assert u[0, 0] == pytest.approx(-(K[0] @ [0.005, -0.01])[0])
+    assert u[1, 0] == pytest.approx(-(K[1] @ [0, 0.01])[0])
+    assert u[2, 0] == pytest.approx(u[0, 0])  # axes wrap
+    assert u[3, 0] == result.control_vectors[result.control_index[5 * 50 + 5], 0]
+
+
+def test_controls_stay_in_their_range_and_owners_are_nearest():
+    gain = {"u": {"x": [1000, -1000], "y": 0}}
+    local = local_of(
+        made(
+            standard_map(
+                50,
+                local_controller={
+                    "kind": "linear", "orbit": ORBIT, "control": {"u": 0.0}, "gain": gain,
+                },
+            )
+        )
+    )  # fmt: skip
+    cells = np.flatnonzero(local.attractor)
+    assert local.owner(cells).tolist() == [0, 0, 1, 1]
+    x = local.partition.centres(cells) + np.array([0.001, 0])
+    np.testing.assert_allclose(local(x, cells)[:, 0], [-0.5, -0.5, 0.5, 0.5])
+
+
+def test_a_python_function_is_differentiated_too():
+    def step(x, y, u):
+        kick = 0.25 * u * np.sin(2 * np.pi * x)
+        return x + y + kick, y + kick
+
+    data = standard_map(50, local_controller={"kind": "lqr", "orbit": ORBIT})
+    formula = local_of(made(data))
+    problem = made(data).replaced(system=lm.systems.FunctionSystem(next=step))
+    function = local_of(problem)
+    np.testing.assert_allclose(function.gain, formula.gain, rtol=1e-7)
+    found = check(problem, function)
+    assert (found.proved, found.kept) == (None, 10_000)
+
+
+def test_a_saved_python_function_keeps_the_outer_controller(tmp_path):
+    data = steps(local_controller={"kind": "lqr", "orbit": [[0.0]]})
+    function = lm.systems.FunctionSystem(next=lambda x, u: [x - 0.25 * u])
+    problem = made(data).replaced(system=function)
+    result = lm.solve(problem)
+    assert result.controller([[0.1]]) == pytest.approx(-0.1 * result.controller.local.gain[0, 0, 0])
+    result.save(tmp_path / "out")
+    loaded = lm.Result.load(tmp_path / "out")
+    assert loaded.local_controller == result.local_controller
+    assert np.isnan(loaded.controller([[0.1]])).all()
+    assert loaded.controller([[0.3]]) == 1
+    assert lm.verify(tmp_path / "out").holds
+
+
+def test_noise_counts_at_every_node():
+    data = linear_system([[0.5]], [[1.0]], cells=8, attractor={"boxes": [{"x0": [-0.25, 0.25]}]})
+    data["system"]["next"]["x0"] += " + w"
+    data["local_controller"] = {"kind": "linear", "orbit": [[0]], "gain": {"u0": {"x0": 0.25}}}
+    for amplitude, proved in ((0.15, 2), (0.24, 0)):
+        values = [-amplitude, amplitude]
+        data["noise"] = {"w": {"values": values, "weights": [0.5, 0.5]}}
+        problem = made(data)
+        found = check(problem, local_of(problem))
+        assert found.proved == proved
+        assert (found.kept == 10_000) == (proved == 2)
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(st.integers(0, 2**32 - 1))
+def test_what_is_proved_holds_at_every_point(seed):
+    rng = np.random.default_rng(seed)
+    d = int(rng.integers(1, 3))
+    A = (rng.standard_normal((d, d)) * rng.choice([0.3, 0.8])).round(3).tolist()
+    B = rng.standard_normal((d, 1)).round(3).tolist()
+    data = linear_system(A, B, cells=int(rng.choice([4, 8])))
+    if rng.random() < 0.5:
+        data["on_exit"] = "clip"
+    if rng.random() < 0.3:
+        for axis in data["state_box"].values():
+            axis["periodic"] = True
+        data.pop("on_exit", None)
+    if rng.random() < 0.7:
+        bend = rng.choice(["sin(3*x0) - 3*x0", "abs(x0)", "0.3*x0**2", "min(x0, 0)*x0"])
+        data["system"]["next"]["x0"] += f" + {float(rng.choice([0.3, 1.0]))!r}*({bend})"
+    gain = {"u0": {f"x{i}": float(rng.standard_normal()) for i in range(d)}}
+    data["local_controller"] = {"kind": "linear", "orbit": [[0] * d], "gain": gain}
+    problem = made(data)
+    local = local_of(problem)
+    found = check(problem, local)
+    # An independent count: cells none of whose many points, rim included, leaves A.
+    partition = local.partition
+    cells = np.flatnonzero(local.attractor)
+    ticks = np.linspace(0, 1, 41)
+    offsets = np.stack(np.meshgrid(*[ticks] * d), axis=-1).reshape(-1, d)
+    good = 0
+    for cell in cells:
+        corner = partition.low + np.array(partition.multi_index(np.array([cell]))).T[0] * 2 / (
+            partition.cells
+        )
+        x = corner + offsets * partition.width
+        u = np.clip(-sum(local.gain[0, 0, i] * x[:, i] for i in range(d)), -1, 1)
+        values = {f"x{i}": x[:, i] for i in range(d)} | {"u0": u}
+        target = partition.locate([np.broadcast_to(y, len(x)) for y in problem.step()(values)])
+        good += bool(((target >= 0) & local.attractor[target]).all())
+    assert found.proved <= good
+    assert not (found.kept < found.samples and found.proved == found.cells)
+    if good == 0:
+        assert found.kept < found.samples
+
+
+def test_a_contraction_is_proved_and_an_expansion_is_not():
+    for factor, proved in ((0.5, 4), (0.999, 4), (1.001, 0)):
+        rotation = (factor / np.sqrt(2) * np.array([[1, -1], [1, 1]])).tolist()
+        for system, count in ((np.diag([factor, factor]).tolist(), proved), (rotation, None)):
+            data = linear_system(system, [[0.0], [0.0]])
+            data["local_controller"] = {"kind": "linear", "orbit": [[0, 0]], "gain": {}}
+            problem = made(data)
+            found = check(problem, local_of(problem))
+            if count is not None:
+                assert found.proved == count
+
+
+def test_the_law_has_no_jump_inside_a_cell_of_a_circle():
+    # One cell straddles the far side of the circle from its orbit point.
+    data = doubling(attractor={"cells": [[0], [1]]})
+    data["system"]["next"] = {"x": "0.2 + 0*x"}
+    data["state_box"]["x"]["cells"] = 3
+    data["control_grid"] = {"u": {"values": [-9, 9]}}
+    data["local_controller"] = {"kind": "linear", "orbit": [[0.2]], "gain": {"u": {"x": 1}}}
+    local = local_of(made(data))
+    x = np.linspace(0.34, 0.66, 33)[:, None]
+    u = local(x, np.ones(33, dtype=np.int64))[:, 0]
+    np.testing.assert_allclose(u, 0.2 - x[:, 0])
+
+
+def test_it_survives_saving_and_a_false_one_is_found(tmp_path):
+    data = standard_map(30, local_controller={"kind": "lqr", "orbit": ORBIT})
+    problem = made(data)
+    assert made(problem.to_dict()) == problem
+    result = lm.solve(problem)
+    result.save(tmp_path / "out")
+    loaded = lm.Result.load(tmp_path / "out")
+    assert loaded.local_controller == result.local_controller
+    x = np.random.default_rng(0).random((200, 2))
+    np.testing.assert_array_equal(loaded.controller(x), result.controller(x))
+    assert lm.verify(tmp_path / "out").holds
+    path = tmp_path / "out" / "certificate.json"
+    good = json.loads(path.read_text())
+    stored = good["local_controller"]
+    for key, value in (("multiplier", stored["multiplier"] / 2), ("proved", stored["cells"] + 1),
+                       ("kept", stored["kept"] + 1)):  # fmt: skip
+        path.write_text(json.dumps({**good, "local_controller": {**stored, key: value}}))
+        assert f"local_controller.{key}" in lm.verify(tmp_path / "out").reasons[0]
+    for broken in ({}, [], {**stored, "proved": "all"}, {**stored, "more": 1}, "yes",
+                   {**stored, "multiplier": 10**400}):  # fmt: skip
+        path.write_text(json.dumps({**good, "local_controller": broken}))
+        with pytest.raises(lm.BadInput, match="local_controller"):
+            lm.Result.load(tmp_path / "out")
+    del good["local_controller"]  # a result of an earlier version
+    path.write_text(json.dumps(good))
+    assert lm.Result.load(tmp_path / "out").local_controller is None
+
+
+@pytest.mark.parametrize(
+    ("local", "message"),
+    [
+        ({"kind": "pid"}, "'kind' is missing or unknown; known kinds: constant"),
+        ({"kind": "constant", "control": {"v": 0}}, "local_controller.control: 'v' is unknown"),
+        ({"kind": "constant", "control": {"u": 2}}, "control.u: 2.0 is outside the control grid"),
+        ({"kind": "lqr", "orbit": []}, "local_controller.orbit: "),
+        ({"kind": "lqr", "orbit": [[0.25]]}, "orbit[0]: 1 coordinates for 2 axes"),
+        ({"kind": "lqr", "orbit": [{"x": 0.25, "z": 0}]}, "orbit[0]: a point names every axis"),
+        ({"kind": "lqr", "orbit": [[0.25, 0.5]]}, "orbit: point 0 is mapped to [0.75, 0.5], 25"),
+        ({"kind": "lqr", "orbit": [[0.1, 0.5], [0.6, 0.5]]}, "orbit[0]: the point lies in no"),
+        ({"kind": "lqr", "orbit": ORBIT, "state_weights": {"x": 0}}, "state_weights.x: 0"),
+        ({"kind": "lqr", "orbit": ORBIT, "state_weights": {"u": 1}}, "state_weights: 'u' is"),
+        ({"kind": "lqr", "orbit": ORBIT, "control": {"u": [0]}}, "control.u: 1 values for 2"),
+        ({"kind": "linear", "orbit": ORBIT, "gain": {"x": {}}}, "gain: 'x' is unknown"),
+        ({"kind": "linear", "orbit": ORBIT, "gain": {"u": {"x": [1, 2, 3]}}}, "gain.u.x: 3 values"),
+        ({"kind": "lqr", "orbit": [[0.25, 0.5]] * 65}, "local_controller.orbit"),
+    ],
+)  # fmt: skip
+def test_bad_ones_are_refused(local, message):
+    with pytest.raises(lm.BadInput) as caught:
+        lm.compile(made(standard_map(50, local_controller=local)))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_cannot_be_regulated_is_refused():
+    data = linear_system([[2.0, 0.0], [0.0, 0.5]], [[0.0], [1.0]])
+    data["local_controller"] = {"kind": "lqr", "orbit": [[0, 0]]}
+    with pytest.raises(lm.BadInput, match="cannot stabilize the linearisation"):
+        lm.compile(made(data))
+
+
+def test_a_jump_at_the_orbit_cannot_be_linearised():
+    data = linear_system([[0.5]], [[1.0]])
+    data["system"]["next"]["x0"] += " + 0.1*sign(x0)"
+    data["local_controller"] = {"kind": "lqr", "orbit": [[0]]}
+    with pytest.raises(lm.BadInput, match="not differentiable"):
+        lm.compile(made(data))
+
+
+def test_a_long_enclosure_stops_in_time(monkeypatch):
+    text = " + ".join(["0.001*sin(x0)"] * 150)
+    data = linear_system([[0.5]], [[1.0]], cells=2000)
+    data["attractor"] = {"boxes": [{"x0": [-0.9, 0.9]}]}
+    data["system"] = {"kind": "ode", "derivative": {"x0": f"u0 - x0 + {text}"}, "step": 1e-6,
+                      "substeps": 1000}  # fmt: skip
+    data["local_controller"] = {"kind": "constant"}
+    problem = made(data)
+    found = check(problem, local_of(problem))
+    assert (found.cells, found.proved, found.kept) == (1800, 0, 10_000)  # nothing is claimed
+    data["system"] = {"kind": "map", "next": {"x0": "0.5*x0"}}
+    data["state_box"]["x0"]["cells"] = 100_000
+    problem = made(data)
+    assert check(problem, local_of(problem)).proved == 90_000
+    monkeypatch.setattr("lmdsl.local_check.WORK", 1e5)
+    found = check(problem, local_of(problem))
+    assert 0 < found.proved < found.cells  # what the work allowed
+
+
+def test_the_autonomous_case():
+    data = doubling(attractor={"points": [[0.0]]}, local_controller={"kind": "lqr", "orbit": [[0]]})
+    local = local_of(made(data))
+    assert local.gain.shape == (1, 0, 1)
+    assert local.multiplier == pytest.approx(2.0)
