@@ -17,7 +17,7 @@ from lmdsl.cli import main
 KEYS = [
     "status", "backend", "solver_status", "gamma", "cost", "lower_bound", "gap", "tolerance",
     "contraction", "gamma_bar", "cells", "controls", "pairs", "attractor_cells",
-    "stabilizable_cells", "polish_steps", "seconds", "message",
+    "stabilizable_cells", "polish_steps", "seconds", "beyond_gamma", "message",
 ]  # fmt: skip
 
 

@@ -28,13 +28,14 @@ declarations
 problem
 sampling memory
 partition rows
+boxes
 regions
 transitions
 graph
 lp
 bellman linear
 bounds
-policy
+policy growth
 gamma
 backends.base
 backends.scaled
@@ -47,7 +48,6 @@ controller
 result
 archive
 stabilize
-boxes
 facts
 phase_one hints
 explanation
