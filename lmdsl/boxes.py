@@ -47,6 +47,58 @@ class Region:
         return {"box": {name: list(ends) for name, ends in self.box.items()}, "cells": self.cells}
 
 
+MOST_REGIONS = 8
+"""Boxes by which a set of cells is named."""
+
+
+@dataclass(frozen=True)
+class Area:
+    """A set of cells, by region.
+
+    Attributes
+    ----------
+    cells
+        Indices of its cells in the box, ascending.
+    regions
+        Disjoint boxes of such cells only, largest first.
+    elsewhere
+        Number of the cells in none of these boxes.
+    """
+
+    cells: NDArray[np.int64]
+    regions: tuple[Region, ...]
+    elsewhere: int
+
+    @classmethod
+    def of(cls, partition: Partition, cells: NDArray[np.int64], limit: int = MOST_REGIONS) -> Area:
+        """Describe cells, given by their indices, with at most ``limit`` boxes."""
+        mask = np.zeros(partition.size, dtype=np.bool_)
+        mask[cells] = True
+        found = regions(partition, mask, limit)
+        inside = sum(region.cells for region in found)
+        return cls(np.flatnonzero(mask), found, int(mask.sum()) - inside)
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def text(self, most: int = 3) -> str:
+        """Return the largest boxes, and how many cells lie elsewhere, as text."""
+        named = self.regions[:most]
+        parts = [f"{region.cells} in {region}" for region in named]
+        elsewhere = len(self) - sum(region.cells for region in named)
+        return "; ".join([*parts, f"{elsewhere} elsewhere"] if elsewhere else parts)
+
+    __str__ = text
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return strict JSON data: the number of cells and the regions."""
+        return {
+            "cells": len(self.cells),
+            "regions": [region.to_dict() for region in self.regions],
+            "elsewhere": self.elsewhere,
+        }
+
+
 def shown(box: Ends) -> str:
     """Return a box as text, such as "x in [0, 1], y in [2, 3]"."""
     return ", ".join(f"{name} in [{a + 0.0:.6g}, {b + 0.0:.6g}]" for name, (a, b) in box.items())

@@ -285,23 +285,16 @@ def _export(parsed: Arguments) -> int:
 
 def _gamma_max(parsed: Arguments) -> int:
     from lmdsl.gamma import gamma_max
-    from lmdsl.lp import compile
     from lmdsl.problem import load
-    from lmdsl.result import jsonable
 
     problem = load(parsed.file)
     with _Progress() as progress:
-        lp = compile(problem, progress)
-        found = gamma_max(lp, progress) if lp.n else None
+        found = gamma_max(problem, progress)
     if parsed.json:
-        _print_json({"gamma_bar": jsonable(found and [found.low, found.high])})
-    elif found is None:
-        print("no cell is stabilizable, so there is no gamma_bar")
+        _print_json(found.to_dict())
     else:
-        print(f"gamma_bar lies in [{found.low!r}, {found.high!r}]")
-        if found.note:
-            print(f"  {found.note}")
-    return 0 if found else 3
+        print(found.text())
+    return 0 if found.stabilizable else 3
 
 
 def _explain(parsed: Arguments) -> int:

@@ -9,25 +9,28 @@ high   w >= 0, w != 0 with w <= high P_a w for every surviving pair: at gamma >=
 gamma_bar is infinite exactly when C is exhausted by levels "some surviving pair has all
 successors in A or in lower levels": then a policy reaches A within a fixed number of steps.
 
-From below: unit-cost policy iteration at some gamma, then gamma is raised to just under the limit
-of the policy found, again and again. Close to its limit the value of a policy is dominated by its
-slowest class, so improving it shrinks the largest spectral radius. From above: at a gamma slightly
-beyond the limit reached, optimal stopping gives the vector, supported where growth wins, zero
-elsewhere; plain power iteration would not close the bracket for reducible structures.
+The limit of one policy is found class by class (:mod:`lmdsl.growth`). Then *optimal stopping* at a
+gamma slightly beyond that limit decides whether the policy is as good as any. Its greatest solution
+w is the upper vector, supported where growth wins and zero elsewhere (plain power iteration would
+not close the bracket for reducible structures); or w = 0, and the policy it ends with is
+stabilizing at that gamma: a better policy, from which to go on. Policy iteration under unit cost
+just below the limit takes most steps at once, and halving the bracket bounds their number.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lmdsl import bounds, linear, policy
-from lmdsl.errors import BadInput
+from lmdsl import bounds, growth, policy
+from lmdsl.boxes import Area
 from lmdsl.graph import CellStatus
+from lmdsl.growth import Growth
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.transitions import Progress
@@ -37,6 +40,9 @@ Pairs = NDArray[np.int64]
 
 WIDTH = 1e-6
 """Relative width of the bracket aimed at."""
+
+STEPS = (0.1 * WIDTH, 0.4 * WIDTH, 10 * WIDTH, 1e-3, 0.1, 1.0)
+"""How far beyond the limit of a policy optimal stopping is asked, until doubles decide."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +61,15 @@ class GammaBar:
     w_high
         w >= 0, not 0, with w <= high P_a w for every pair, shape (n,); None where high is infinite.
     note
-        Empty, or why the bracket is wider than 1e-6.
+        Empty, or why the bracket is wider than 1e-6, or that no cell is stabilizable.
+    beyond
+        The cells with w_high > 0: no policy has finite cost from them at gamma >= high. None
+        where high is infinite.
+    limiting
+        Those of them that limit gamma_bar: a w that is 0 on all other cells satisfies the same
+        inequality, whatever happens there. The rest of ``beyond`` cannot avoid them, or worse.
+    stabilizable
+        Number of cells of C. Where it is 0, low and high are 0: no gamma is feasible.
     """
 
     low: float
@@ -64,6 +78,50 @@ class GammaBar:
     w_low: Floats | None
     w_high: Floats | None
     note: str = ""
+    beyond: Area | None = None
+    limiting: Area | None = None
+    stabilizable: int = 0
+
+    @property
+    def corner(self) -> bool:
+        """True when gamma_bar is that of a part of C; the other cells allow a larger gamma."""
+        return self.beyond is not None and len(self.beyond) < self.stabilizable
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return strict JSON data; ``gamma_bar`` is None where no cell is stabilizable."""
+        bracket = [x if math.isfinite(x) else "inf" for x in (self.low, self.high)]
+        return {
+            "gamma_bar": bracket if self.stabilizable else None,
+            "stabilizable_cells": self.stabilizable,
+            "limiting": self.limiting and self.limiting.to_dict(),
+            "beyond": self.beyond and self.beyond.to_dict(),
+            "note": self.note,
+        }
+
+    def text(self) -> str:
+        """Return the bracket and the cells behind it for people."""
+        if not self.stabilizable:
+            return f"{self.note}, so there is no gamma_bar"
+        lines = [f"gamma_bar lies in [{self.low!r}, {self.high!r}]"]
+        if self.note:
+            lines.append(f"  {self.note}")
+        if self.beyond is not None and self.limiting is not None:
+            limiting, beyond, n = self.limiting, self.beyond, self.stabilizable
+            lines.append(f"  limited by {len(limiting)} of {n} stabilizable cells: {limiting}")
+            if len(beyond) > len(limiting):
+                also = f": {beyond}" if self.corner else ""
+                lines.append(f"  with those that cannot avoid them {len(beyond)} cells{also}")
+            if self.corner:
+                lines.append(f"  {CORNER}")
+        return "\n".join(lines)
+
+    __str__ = text
+
+
+CORNER = (
+    "this corner limits gamma_bar for all; --restrict-to-gamma (restrict_to_gamma=True) solves on "
+    "the cells for which gamma is feasible"
+)
 
 
 def gamma_max(problem: Problem | StabilizationLP, progress: Progress | None = None) -> GammaBar:
@@ -80,63 +138,71 @@ def gamma_max(problem: Problem | StabilizationLP, progress: Progress | None = No
     -------
     GammaBar
         Relative width at most 1e-6, wider only where the vectors leave the range of doubles.
+        Where no cell is stabilizable, no gamma is feasible: both ends are 0.
 
     Raises
     ------
     BadInput
-        The problem cannot be compiled, or no cell is stabilizable.
+        The problem cannot be compiled.
     """
     lp = compile(problem, progress) if isinstance(problem, Problem) else problem
-    if not lp.n:
-        raise BadInput("no cell is stabilizable, so there is no gamma_bar")
     if progress:
         progress("gamma-max", -1.0)
     return bracket(lp)
 
 
 def bracket(lp: StabilizationLP, stop: policy.Stop = lambda: False, limit: int = 60) -> GammaBar:
-    """Enclose gamma_bar of a model with at least one cell; ``stop`` ends the work early."""
+    """Enclose gamma_bar of a compiled model; ``stop`` ends the work early."""
+    if not lp.n:
+        nobody = np.empty(0, dtype=np.int64)
+        return GammaBar(0.0, 0.0, nobody, None, None, "no cell is stabilizable")
     certain = exhausted_by_levels(lp)
     if certain is not None:
-        return GammaBar(math.inf, math.inf, certain, None, None)
-    best = _from_below(lp, lp.tree[1], 1.0)
+        return GammaBar(math.inf, math.inf, certain, None, None, stabilizable=lp.n)
+    best = growth.of_policy(lp, lp.tree[1])
+    low, w_low, proved = 0.0, None, best.pair
     high, w_high = math.inf, None
-    overflow = False
     for _ in range(limit):
+        best = best if stop() else _climbed(lp, best, stop)
+        found = growth.prove_low(lp, best)
+        if found is not None and found[0] > low:
+            low, w_low, proved = *found, best.pair
         if stop():
             break
-        climbed = _climb(lp, best)
-        if climbed is not None and climbed.low > best.low:
-            best = climbed
-        for step in (0.4 * WIDTH, 10 * WIDTH, 1e-3, 0.1, 1.0):
-            found = _from_above(lp, best.low * (1 + step))
-            if found is not None:
-                if found[0] < high:
-                    high, w_high = found
+        needed = check_high(lp, best.slow_vector)
+        if needed is not None and needed < high:
+            high, w_high = needed, best.slow_vector
+        closed = high <= low * (1 + WIDTH)
+        better = None
+        for step in STEPS[:1] if closed else STEPS:
+            answer = _beyond(lp, best, best.limit * (1 + step), stop)
+            if isinstance(answer, Growth):
+                better = answer
                 break
-        if high <= best.low * (1 + WIDTH):
+            if answer is not None:
+                # Of two vectors that close the bracket the one of optimal stopping names all cells.
+                if answer[0] < high or (closed and answer[0] <= low * (1 + WIDTH)):
+                    high, w_high = answer
+                break
+        if better is None or high <= low * (1 + WIDTH):
             break
-        if climbed is None or climbed.low <= best.low * (1 + 1e-13):
-            between = _between(lp, best, high)
-            if between is None:
-                overflow = True
-                break
-            best = between
+        best = better
+        # Halve the bracket too, so that many small gains cannot make it long.
+        top = high if math.isfinite(high) else 4 * best.limit
+        answer = _beyond(lp, best, math.sqrt(best.limit * top), stop)
+        if isinstance(answer, Growth):
+            best = answer
+        elif answer is not None and answer[0] < high:
+            high, w_high = answer
     note = ""
-    if high > best.low * (1 + WIDTH):
+    if high > low * (1 + WIDTH):
         note = "the vectors leave the range of doubles; the bracket is as tight as they allow"
-        note = note if overflow else "the work was ended before the bracket closed"
-    return GammaBar(best.low, high, best.pair, best.w_low, w_high, note)
-
-
-def check_low(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
-    """Return the largest low (rounded down) with low P_u w <= w, None where w > 0 fails."""
-    if not (np.isfinite(w).all() and (w > 0).all()):
-        return None
-    ahead = bounds.expected_above(lp, pair, w, 1.0)
-    with np.errstate(divide="ignore"):
-        ratio = w / ahead
-    return float(ratio.min()) * (1 - 4 * bounds.UNIT)
+        note = "the work was ended before the bracket closed" if stop() else note
+    beyond = limiting = None
+    if w_high is not None:
+        core, high = _core(lp, best, w_high, high, low * (1 + WIDTH), stop)
+        beyond, limiting = (Area.of(lp.partition, lp.cells[w > 0]) for w in (w_high, core))
+    return GammaBar(low, high, proved, w_low, w_high, note, beyond, limiting, lp.n)
 
 
 def check_high(lp: StabilizationLP, w: Floats) -> float | None:
@@ -158,93 +224,109 @@ def exhausted_by_levels(lp: StabilizationLP) -> Pairs | None:
     return pair if (pair >= 0).all() else None
 
 
-def _from_below(lp: StabilizationLP, pair: Pairs, gamma: float) -> GammaBar:
-    w = policy.evaluate(lp, pair, gamma, np.ones(lp.K))
-    low = None if w is None else check_low(lp, pair, w)
-    if low is None:  # a transient policy always has a value at gamma = 1 unless doubles end
-        return GammaBar(0.0, math.inf, pair, None, None)
-    return GammaBar(low, math.inf, pair, w, None)
-
-
-def _climb(lp: StabilizationLP, start: GammaBar) -> GammaBar | None:
-    """Improve the policy under unit cost just below its limit, then find its new limit."""
+def _climbed(lp: StabilizationLP, start: Growth, stop: policy.Stop) -> Growth:
+    """Improve a policy under unit cost just below its limit, where its value fits into doubles."""
     unit = np.ones(lp.K)
-    at = start.low * (1 - 1e-3)
-    value = policy.evaluate(lp, start.pair, at, unit)
-    if value is None:
+    for below in (1e-3, 0.1):
+        at = start.limit * (1 - below)
+        value = policy.evaluate(lp, start.pair, at, unit)
+        if value is None:
+            continue
+        done = policy.iterate(lp, start.pair, value, at, unit, stop=stop)
+        if not done.steps:
+            return start
+        found = growth.of_policy(lp, done.pair)
+        return found if found.limit > start.limit else start
+    return start
+
+
+def _beyond(
+    lp: StabilizationLP, start: Growth, gamma: float, stop: policy.Stop
+) -> Growth | tuple[float, Floats] | None:
+    """Decide a gamma: a policy that is stabilizing there, or a proved high and its vector.
+
+    Neither where doubles do not decide. The first stopping policy goes on wherever the class of
+    ``start`` does not grow.
+    """
+    going = start.rate * gamma < 1 - 1e-12
+    found = policy.optimal_stopping(lp, gamma, np.ones(lp.n), start.pair, going, stop)
+    if found is None:
         return None
-    done = policy.iterate(lp, start.pair, value, at, unit)
-    return _limit(lp, done.pair, max(start.low, at), done.value)
+    if not found.refuses:
+        better = growth.of_policy(lp, found.pair) if found.going.all() else None
+        return better if better is not None and better.limit > start.limit else None
+    # Small entries may be rounding, or what carries a vector that falls over many decades.
+    answers = [(check_high(lp, w) or math.inf, w) for w in (found.carried, found.w)]
+    high, w = min(answers, key=lambda answer: answer[0])
+    return (high, w) if math.isfinite(high) else None
 
 
-def _limit(lp: StabilizationLP, pair: Pairs, at: float, guess: Floats) -> GammaBar | None:
-    """Return a proved low of a policy, close to 1/rho(P_u)."""
-    best = _proved(lp, pair, guess)
-    gamma = at
-    # Inverse iteration: v = (I - gamma P)^-1 v grows by 1/(1 - gamma rho) in the slowest class.
-    for _ in range(40):
-        v = policy.evaluate(lp, pair, gamma, np.ones(lp.K))
-        if v is None:
+def _core(
+    lp: StabilizationLP,
+    best: Growth,
+    w_high: Floats,
+    high: float,
+    most: float,
+    stop: policy.Stop,
+) -> tuple[Floats, float]:
+    """Return an upper vector on the slowest classes alone, and a high that holds for it too.
+
+    Their Perron vectors serve where the best policy is also the least favourable one for them. Else
+    stopping is rewarded in these classes only. Where neither closes the bracket (the controls can
+    dodge from one slow class to another), w_high itself serves.
+    """
+    needed = check_high(lp, best.slow_vector)
+    if needed is not None and needed <= max(most, high):
+        return best.slow_vector, max(high, needed)
+    reward = np.where(best.slowest & (w_high > 0), 1.0, 0.0)
+    if (reward[w_high > 0] > 0).all():
+        return w_high, high
+    for gamma in (high, high * (1 + 0.1 * WIDTH)):
+        found = policy.optimal_stopping(lp, gamma, reward, stop=stop)
+        if found is None:
             break
-        found = _proved(lp, pair, v)
-        if found is not None and (best is None or found.low > best.low):
-            best = found
-        growth = _growth(lp, pair, gamma, v)
-        if growth is None:
-            break
-        limit = gamma / (1 - 1 / growth)
-        if limit <= gamma * (1 + 2e-7):
-            break
-        # Aim just below the estimated limit; halve the distance where that overshoots.
-        for share in (1 - 1e-1, 0.5, 0.1):
-            target = gamma + share * (limit - gamma)
-            if limit - gamma < 1e-5 * gamma:
-                target = limit * (1 - 1e-7) if share > 0.6 else target
-            if target > gamma and policy.evaluate(lp, pair, target, np.ones(lp.K)) is not None:
-                gamma = target
-                break
-        else:
-            break
-    return best
+        core = np.where(reward > 0, found.carried, 0.0)
+        needed = check_high(lp, core) if found.refuses else None
+        if needed is not None and needed <= max(most, high):
+            return core, max(high, needed)
+    return w_high, high
 
 
-def _growth(lp: StabilizationLP, pair: Pairs, gamma: float, v: Floats) -> float | None:
-    """Return the largest factor by which one more inverse step makes a component grow."""
-    M = gamma * lp.rows.matrix(pair)
-    top = float(v.max())
-    scaled = v / top
-    x = linear.solve(M, scaled)
-    if x is None or not np.isfinite(x).all():
-        return None
-    return max(float((x / scaled).max()), 1 + 1e-12)
+def refusal_message(
+    lp: StabilizationLP, w: Floats, limits: GammaBar, bracket: tuple[float, float]
+) -> str:
+    """Return the sentence that refuses a gamma: the bracket, the cells, and what can be done.
+
+    Parameters
+    ----------
+    lp, w
+        The model, and the vector that proves its gamma infeasible, shape (n,).
+    limits, bracket
+        What is known of gamma_bar.
+    """
+    cells = Area.of(lp.partition, lp.cells[w > 0])
+    left = lp.n - len(cells)
+    parts = [
+        f"gamma = {lp.gamma!r} is not below gamma_bar, which lies in "
+        f"[{bracket[0]:.9g}, {bracket[1]:.9g}]: proved that no control makes the cost finite from "
+        f"{_counted(cells)}"
+    ]
+    limiting = limits.limiting
+    if limiting is not None and len(limiting) != len(cells):
+        parts.append(f"gamma_bar is limited by {_counted(limiting)}")
+    if left:
+        parts.append(
+            "this corner limits gamma_bar for all; lower gamma, or solve on the other "
+            f"{left} cells with --restrict-to-gamma (restrict_to_gamma=True)"
+        )
+    else:
+        parts.append("lower gamma")
+    return "; ".join(parts)
 
 
-def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> GammaBar | None:
-    low = check_low(lp, pair, w)
-    return None if low is None else GammaBar(low, math.inf, pair, w, None)
-
-
-def _from_above(lp: StabilizationLP, gamma: float) -> tuple[float, Floats] | None:
-    """Return a proved high close to gamma and its vector, None where gamma is feasible."""
-    at = replace(lp, gamma=gamma)
-    w = policy.refusal(at)
-    if w is None:
-        return None
-    high = check_high(lp, w)
-    return None if high is None or not math.isfinite(high) else (high, w)
-
-
-def _between(lp: StabilizationLP, best: GammaBar, high: float) -> GammaBar | None:
-    """Look for a better policy strictly inside the bracket."""
-    top = high if math.isfinite(high) else 4 * best.low
-    for share in (0.5, 0.1, 0.01):
-        gamma = best.low + share * (top - best.low)
-        found = policy.stabilizing(replace(lp, gamma=gamma))
-        if isinstance(found, policy.Feasible):
-            better = _limit(lp, found.pair, gamma, found.w)
-            if better is not None and better.low > best.low:
-                return better
-    return None
+def _counted(area: Area) -> str:
+    """Return how many cells an area has, and where, as text."""
+    return f"{len(area)} cell{'s' * (len(area) != 1)} ({area})"
 
 
 def restricted(lp: StabilizationLP, w: Floats) -> StabilizationLP | None:

@@ -90,17 +90,11 @@ def _sweep(M: Any, b: Floats, x: Floats, count: int) -> tuple[Floats, float, flo
 
 def solve_by_class(M: Any, b: Floats) -> tuple[Floats | None, bool]:
     """Solve class by class; return x or None, and whether every class was small enough to try."""
-    from scipy.sparse.csgraph import connected_components
-
-    count, label = connected_components(M, directed=True, connection="strong")
-    size = np.bincount(label, minlength=count)
-    if size.max(initial=0) > MAX_FACTORED:
+    order, ends = classes(M)
+    lengths = np.diff(ends, prepend=0)
+    count = len(ends)
+    if lengths.max(initial=0) > MAX_FACTORED:
         return None, False
-    rank = _topological(M.indptr, M.indices, label, count)
-    order = np.argsort(rank[label], kind="stable")
-    lengths = np.empty(count, dtype=np.int64)
-    lengths[rank] = size
-    ends = np.cumsum(lengths)
     x = np.zeros(len(b))
     begun = 0
     for k in np.append(np.flatnonzero(lengths > 1), count):
@@ -114,6 +108,20 @@ def solve_by_class(M: Any, b: Floats) -> tuple[Floats | None, bool]:
             return None, True
         begun = ends[k]
     return x, True
+
+
+def classes(M: Any) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the cells ordered by strongly connected class, and where each class ends.
+
+    Every class comes after all it leads to: class k is ``order[ends[k - 1]:ends[k]]``.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    count, label = connected_components(M, directed=True, connection="strong")
+    rank = _topological(M.indptr, M.indices, label, count)
+    lengths = np.empty(count, dtype=np.int64)
+    lengths[rank] = np.bincount(label, minlength=count)
+    return np.argsort(rank[label], kind="stable"), np.cumsum(lengths)
 
 
 def _solve_class(M: Any, b: Floats, x: Floats, cells: NDArray[np.int64]) -> bool:

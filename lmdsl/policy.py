@@ -271,32 +271,114 @@ def refusal(lp: StabilizationLP, stop: Stop = lambda: False) -> Floats | None:
     """Return w >= 0, w != 0 that should satisfy w <= gamma P_a w for every pair, or None.
 
     w is the greatest solution of w = min(1, gamma' min_a P_a w) with gamma' just below gamma (the
-    slack absorbs rounding) or gamma itself: optimal stopping, solved by policy iteration from
-    "stop everywhere", w = 1. It is 0 exactly when gamma' < gamma_bar.
+    slack absorbs rounding) or gamma itself. It is 0 exactly when gamma' < gamma_bar.
+    """
+    for slack in (1e-6, 1e-9, 1e-12, 0.0):
+        found = optimal_stopping(lp, lp.gamma * (1 - slack), np.ones(lp.n), stop=stop)
+        if found is None:
+            return None
+        if found.refuses:
+            return found.carried
+    return None
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """The outcome of optimal stopping.
+
+    Attributes
+    ----------
+    w
+        The greatest solution of w = min(reward, gamma min_a P_a w), shape (n,).
+    pair
+        A column for every cell; it counts where ``going``.
+    going
+        Cells that do not stop.
+    converged
+        False where rounding or the limit ended the work.
+    """
+
+    w: Floats
+    pair: Pairs
+    going: Bools
+    converged: bool
+
+    @property
+    def refuses(self) -> bool:
+        """True when w is not 0."""
+        return float(self.w.max(initial=0.0)) > 1e-9
+
+    @property
+    def carried(self) -> Floats:
+        """Return w without the cells at rounding level: their own rows then ask 0 <= something."""
+        return np.where(self.w > 1e-14 * self.w.max(initial=0.0), self.w, 0.0)
+
+
+def optimal_stopping(
+    lp: StabilizationLP,
+    gamma: float,
+    reward: Floats,
+    pair: Pairs | None = None,
+    going: Bools | None = None,
+    stop: Stop = lambda: False,
+    limit: int = 1000,
+) -> Stopping | None:
+    """Stop in a cell for ``reward``, or go on under the least favourable control, for ever.
+
+    Howard's policy iteration with "stop" as one more control, as :func:`iterate` makes it. Every
+    policy stays transient under gamma P, so a policy that ends with every cell going and w = 0
+    is gamma-stabilizing.
+
+    Parameters
+    ----------
+    lp, gamma
+        The model and the weight.
+    reward
+        Shape (n,), >= 0.
+    pair, going
+        A first policy, transient under gamma P on the cells that go; default: stop everywhere.
+    stop, limit
+        End the work, with None; largest number of steps.
     """
     zero = np.zeros(lp.K)
-    for slack in (1e-6, 1e-9, 1e-12, 0.0):
-        gamma = lp.gamma * (1 - slack)
-        w: Floats = np.ones(lp.n)
+    pair = lp.pair_pointer[:-1].copy() if pair is None else pair
+    going = np.zeros(lp.n, dtype=np.bool_) if going is None else going
+    w = _stopped(lp, gamma, reward, pair, going)
+    if w is None:
         going = np.zeros(lp.n, dtype=np.bool_)
-        pair = lp.pair_pointer[:-1].copy()
-        for _ in range(1000):
-            if stop():
-                return None
-            better = bellman.improve(lp, w, gamma, zero)
-            change = better.value < w * (1 - 1e-13)
+        w = reward
+    for step in range(limit):
+        if stop():
+            return None
+        lowered, new_pair, new_going = w, pair, going
+        for _ in range(step + 1):
+            better = bellman.improve(lp, lowered, gamma, zero)
+            least = np.minimum(better.value, reward)
+            same = np.where(better.value <= reward, new_going & (better.pair == new_pair), False)
+            change = (least < lowered * (1 - 1e-13)) & ~same
             if not change.any():
                 break
-            pair = np.where(change, better.pair, pair)
-            going |= change
-            P = gamma * lp.rows.matrix(pair[going])
-            new = linear.solve(P[:, going], P[:, ~going].sum(axis=1))
-            if new is None:
-                break
-            w = np.ones(lp.n)
-            w[going] = np.minimum(new, 1.0)
-        top = float(w.max(initial=0.0))
-        if top > 1e-9:
-            # Cells at rounding level carry no mass: their own rows then ask 0 <= something.
-            return np.where(w > 1e-14 * top, w, 0.0)
-    return None
+            lowered = np.where(change, least, lowered)
+            new_pair = np.where(change, better.pair, new_pair)
+            new_going = np.where(change, better.value <= reward, new_going)
+        if lowered is w:
+            return Stopping(np.minimum(w, reward), pair, going, True)
+        new = _stopped(lp, gamma, reward, new_pair, new_going)
+        if new is None or not (new < w).any():
+            break  # rounding made a change look better than it is
+        w, pair, going = new, new_pair, new_going
+    return Stopping(np.minimum(w, reward), pair, going, False)
+
+
+def _stopped(
+    lp: StabilizationLP, gamma: float, reward: Floats, pair: Pairs, going: Bools
+) -> Floats | None:
+    """Return what a stopping policy is paid: w = gamma P w where it goes, the reward elsewhere."""
+    w = reward.copy()
+    if going.any():
+        P = gamma * lp.rows.matrix(pair[going])
+        new = linear.solve(P[:, going], P[:, ~going] @ reward[~going])
+        if new is None:
+            return None
+        w[going] = new
+    return w

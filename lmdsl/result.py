@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.boxes import Area
 from lmdsl.certificate import Certificate
 from lmdsl.controller import ClosedLoop, Controller, Simulation, simulate
 from lmdsl.errors import BadInput, shown
@@ -95,7 +96,14 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
-        return {f.name: jsonable(getattr(self, f.name)) for f in fields(Report)}
+        data = {f.name: jsonable(getattr(self, f.name)) for f in fields(Report)}
+        cells = self.beyond_gamma
+        return {**data, "beyond_gamma": cells and cells.to_dict()}
+
+    @property
+    def beyond_gamma(self) -> Area | None:
+        """The cells proved infeasible at this gamma, by region; None where none is."""
+        return None
 
     @property
     def exit_status(self) -> int:
@@ -208,6 +216,14 @@ class Result(Report):
     def closed_loop(self) -> ClosedLoop:
         """The true map under the controller."""
         return ClosedLoop(self.problem, self.controller, self.cell_status)
+
+    @cached_property
+    def beyond_gamma(self) -> Area | None:
+        """The cells proved infeasible at this gamma, by region; None where none is."""
+        mask = self.cell_status == CellStatus.BEYOND_GAMMA
+        if self.cause == "gamma":
+            mask = mask | (self.witness > 0)
+        return Area.of(self.partition, np.flatnonzero(mask)) if mask.any() else None
 
     @cached_property
     def weight(self) -> Floats:

@@ -107,11 +107,7 @@ def solve(
             job.solve_seconds = time.perf_counter() - started
             limits = gamma.bracket(lp, late)
             bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
-            message = (
-                f"gamma = {lp.gamma!r} is not below gamma_bar, which lies in "
-                f"[{bracket[0]:.9g}, {bracket[1]:.9g}]: proved that no control makes the cost "
-                f"finite from {int((w > 0).sum())} cells; lower gamma"
-            )
+            message = gamma.refusal_message(lp, w, limits, bracket)
             return job.refused("gamma", message, verified, bracket)
         first = policy.Undecided(first.pair, first.lower)
     options = Options(

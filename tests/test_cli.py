@@ -17,7 +17,8 @@ from lmdsl.cli import main
 KEYS = [
     "status", "backend", "solver_status", "gamma", "cost", "lower_bound", "gap", "tolerance",
     "contraction", "gamma_bar", "cells", "controls", "pairs", "attractor_cells",
-    "stabilizable_cells", "polish_steps", "seconds", "message", "local_controller",
+    "stabilizable_cells", "polish_steps", "seconds", "message",
+    "local_controller", "beyond_gamma",
 ]  # fmt: skip
 
 

@@ -30,6 +30,7 @@ declarations
 problem
 sampling memory
 partition rows
+boxes
 regions
 local
 local_check
@@ -38,7 +39,7 @@ graph
 lp
 bellman linear
 bounds
-policy
+policy growth
 gamma
 backends.base
 backends.scaled
@@ -51,7 +52,6 @@ controller
 result
 archive
 stabilize
-boxes
 facts
 phase_one hints
 explanation

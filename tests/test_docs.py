@@ -38,7 +38,7 @@ import pytest
 import lmdsl as lm
 from lmdsl import archive, backends, cli, plotting, problem
 from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
-from lmdsl.result import EXIT, Report
+from lmdsl.result import EXIT
 from lmdsl.systems import NAMED
 from lmdsl.testing.checks import CHECKS
 
@@ -268,17 +268,19 @@ def test_the_whole_formula_language_is_described():
 
 def test_outputs_are_described():
     text = doc("command-line.md")
-    assert not missing([*Report.__dataclass_fields__, *EXIT], section(text, "## `lmdsl solve`"))
     result = lm.solve(lm.load(ROOT / "examples/logistic_map.json"))
+    assert not missing([*result.to_dict(), *EXIT], section(text, "## `lmdsl solve`"))
     directory = section(text, "## The result directory")
     stored = archive._certificate(result)
-    assert not missing(set(stored) - set(Report.__dataclass_fields__), directory)
+    assert not missing(set(stored) - set(result.to_dict()), directory)
     assert not missing({*stored["claims"], *archive.TYPES, *archive.MODEL}, directory)
     assert not missing(archive.FILES, directory)
     runs = result.simulate(starts=5)
     assert not missing({*runs.to_dict(), *runs.steps}, section(text, "## `lmdsl simulate`"))
     compared = lm.compare(result.lp, ["policy-iteration"] * 2).to_dict()
     assert not missing({*compared, *compared["agreement"]}, section(text, "## `lmdsl compare`"))
+    limit = lm.gamma_max(result.lp).to_dict()
+    assert not missing(limit, section(text, "## `lmdsl gamma-max`"))
     found = set(lm.Verification.__dataclass_fields__) - {"certificate"}
     assert not missing({*found, "claims"}, section(text, "## `lmdsl verify`"))
 

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
-from models import brute_force, build, random_lp
+from models import brute_force, build, dense, mdp, random_lp
 from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
 from lmdsl import gamma
 from lmdsl.bounds import exactly_below
 from lmdsl.cli import main
-from lmdsl.gamma import check_high, check_low
+from lmdsl.gamma import check_high
+from lmdsl.growth import check_low
 from lmdsl.rows import Rows, Shares
 from lmdsl.sampling import Nodes
 
@@ -52,6 +56,9 @@ def chain(stays: list[int], samples: int = 10) -> lm.StabilizationLP:
         ([9] * 6, 10 / 9),
         ([5, 9, 1, 9, 5], 10 / 9),
         ([1, 1, 1], 10),
+        ([9] * 30, 10 / 9),
+        ([9, 5] * 15, 10 / 9),
+        ([9] * 80, 10 / 9),
     ],
 )
 def test_reducible_structures_close_the_bracket(stays, true):
@@ -64,15 +71,84 @@ def test_reducible_structures_close_the_bracket(stays, true):
     _check_vectors(lp, found)
 
 
-def _check_vectors(lp, found):
-    """Both ends in exact arithmetic."""
-    from dataclasses import replace
-    from fractions import Fraction
+def loops(n: int, stay: int = 9, samples: int = 10) -> lm.StabilizationLP:
+    """Cells in series that stay with probability stay/samples, a little more under control 1."""
+    cells = []
+    for i in range(n):
+        choices = [({i: k, i - 1: samples - k}, 1.0) for k in {stay, min(stay + 1, samples - 1)}]
+        cells.append(choices)
+    return mdp(cells, samples, 1.0)
 
+
+@pytest.mark.parametrize("n", [1, 3, 40, 90])
+def test_equal_slow_classes_in_series(n):
+    """The vector of low grows over up to 500 decades; high needs no growth at all."""
+    lp = loops(n, 90, 100)
+    found = gamma.bracket(lp)
+    assert found.low <= 100 / 90 <= found.high * (1 + 1e-15)
+    assert found.high <= found.low * (1 + 1e-6)
+    assert found.note == ""
+    assert lp.control[found.pair].tolist() == [0] * n
+    assert len(found.limiting) == len(found.beyond) == n
+    assert n < 40 or found.w_low.max() > 1e200 * found.w_low.min()
+    _check_vectors(lp, found)
+
+
+@pytest.mark.parametrize(("n", "up", "down"), [(100, 5, 90), (150, 1, 20), (60, 40, 59)])
+def test_one_class_whose_vectors_fall_over_many_decades(n, up, down):
+    """A walk up and down a line; rho of the tridiagonal matrix, up to the wall at the top."""
+    cells = []
+    for i in range(n):
+        above, stay = (i + 1, 100 - up - down) if i + 1 < n else (i, 0)
+        row = {above: up + (100 - up - down if i + 1 == n else 0), i - 1: down}
+        cells.append([({**row, **({i: stay} if stay else {})}, 1.0)])
+    lp = mdp(cells, 100, 1.0)
+    found = gamma.bracket(lp)
+    assert found.high <= found.low * (1 + 1e-6)
+    P = dense(lp)
+    scale = (up / down) ** (np.arange(n) / 2)  # makes all but the last row symmetric
+    rho = np.linalg.eigvals(scale[:, None] * P / scale).real.max()
+    assert found.low * (1 - 1e-9) <= 1 / rho <= found.high * (1 + 1e-9)
+    _check_vectors(lp, found)
+
+
+def test_a_bracket_that_doubles_cannot_close_says_so():
+    found = gamma.bracket(loops(300, 90, 100))
+    assert found.low <= 100 / 90 <= found.high
+    assert 1e-6 < found.high / found.low - 1 < 1e-2
+    assert "leave the range of doubles" in found.note
+    assert found.note in found.text()
+    _check_vectors(loops(300, 90, 100), found)
+
+
+@pytest.mark.parametrize("g", [1.11, 1.1111, 100 / 90, 1.2])
+def test_solve_around_the_limit_of_a_long_chain(g):
+    """Never a false yes: it is verified, or says that the numbers do not allow it, or refuses."""
+    result = lm.solve(replace(loops(40, 90, 100), gamma=g))
+    if Fraction(g) < Fraction(10, 9):
+        assert result.status in ("verified", "unverified")
+    else:  # the double nearest to 10/9 is larger than 10/9
+        assert result.status == "not_stabilizable"
+        assert result.gamma_bar[1] <= result.gamma_bar[0] * (1 + 1e-6)
+
+
+def test_ended_early():
+    found = gamma.bracket(chain([9, 5]), stop=lambda: True)
+    assert found.low <= 10 / 9
+    assert found.high == np.inf
+    assert found.note == "the work was ended before the bracket closed"
+    assert found.limiting is found.beyond is None
+
+
+def _check_vectors(lp, found):
+    """Both ends in exact arithmetic, and that the cells named are those of the vectors."""
     at = replace(lp, gamma=found.high)
     assert all(exactly_below(at, k, found.w_high, found.high, None) for k in range(lp.K))
     assert (found.w_high >= 0).all()
     assert found.w_high.any()
+    np.testing.assert_array_equal(found.beyond.cells, lp.cells[found.w_high > 0])
+    assert set(found.limiting.cells) <= set(found.beyond.cells)
+    assert len(found.limiting) > 0
     w = [Fraction(float(x)) for x in found.w_low]
     for i, k in enumerate(found.pair):
         row = lp.rows.exact(int(k))
@@ -144,13 +220,28 @@ def test_command_line(tmp_path, capsys):
     file = tmp_path / "p.json"
     file.write_text(json.dumps(steps()))
     assert main(["gamma-max", str(file), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {"gamma_bar": ["inf", "inf"]}
+    assert json.loads(capsys.readouterr().out) == {
+        "gamma_bar": ["inf", "inf"], "stabilizable_cells": 3, "limiting": None, "beyond": None,
+        "note": "",
+    }  # fmt: skip
     file.write_text(json.dumps(doubling()))
     assert main(["gamma-max", str(file)]) == 0
     assert "gamma_bar lies in" in capsys.readouterr().out
     file.write_text(json.dumps(steps(avoid={"boxes": [{"x": [0.25, 0.5]}]})))
     assert main(["gamma-max", str(file), "--json"]) == 3
-    assert json.loads(capsys.readouterr().out) == {"gamma_bar": None}
+    assert json.loads(capsys.readouterr().out) == {
+        "gamma_bar": None, "stabilizable_cells": 0, "limiting": None, "beyond": None,
+        "note": "no cell is stabilizable",
+    }  # fmt: skip
+    assert main(["gamma-max", str(file)]) == 3
+    assert capsys.readouterr().out == "no cell is stabilizable, so there is no gamma_bar\n"
+
+
+def test_no_cell_is_not_a_bad_input():
+    found = lm.gamma_max(made(steps(avoid={"boxes": [{"x": [0.25, 0.5]}]})))
+    assert found.low == found.high == found.stabilizable == 0
+    assert len(found.pair) == 0
+    assert found.to_dict()["gamma_bar"] is None
 
 
 def corner(gamma_value: float) -> dict:
@@ -196,6 +287,53 @@ def test_one_hard_corner_can_be_left_out(tmp_path):
     assert not lm.verify(tmp_path / "out").holds
     feasible = lm.solve(made(corner(1.5)), restrict_to_gamma=True)
     assert feasible.cell_status.tolist() == [0, 1, 1, 1, 1, 1]
+
+
+CORNER_TEXT = """gamma_bar lies in [1.99999999..., 2.0000000...]
+  limited by 1 of 5 stabilizable cells: 1 in x in [3, 4]
+  with those that cannot avoid them 2 cells: 1 in x in [3, 4]; 1 in x in [5, 6]
+  this corner limits gamma_bar for all; --restrict-to-gamma (restrict_to_gamma=True) solves on the \
+cells for which gamma is feasible"""
+
+
+def test_the_hard_corner_is_named(tmp_path, capsys):
+    found = lm.gamma_max(made(corner(1.0)))
+    assert re.fullmatch(re.escape(CORNER_TEXT).replace(r"\.\.\.", r"\d*"), found.text())
+    assert found.limiting.cells.tolist() == [3]
+    assert found.beyond.cells.tolist() == [3, 5]
+    assert found.corner
+    file = tmp_path / "corner.json"
+    file.write_text(json.dumps(corner(1.0)))
+    assert main(["gamma-max", str(file), "--json"]) == 0
+    data = json.loads(capsys.readouterr().out)
+    box = {"cells": 1, "regions": [{"box": {"x": [3.0, 4.0]}, "cells": 1}], "elsewhere": 0}
+    assert data["limiting"] == box
+    assert data["beyond"]["cells"] == 2
+    assert main(["solve", str(file), "--gamma", "2.5", "--out", str(tmp_path / "out")]) == 3
+    said = capsys.readouterr().out
+    assert "gamma = 2.5 is not below gamma_bar, which lies in [2, 2]" in said
+    assert (
+        "no control makes the cost finite from 2 cells (1 in x in [3, 4]; 1 in x in [5, 6]); "
+        "gamma_bar is limited by 1 cell (1 in x in [3, 4]); this corner limits gamma_bar for all; "
+        "lower gamma, or solve on the other 3 cells with --restrict-to-gamma"
+    ) in said
+    loaded = lm.Result.load(tmp_path / "out")
+    assert loaded.beyond_gamma.cells.tolist() == [3, 5]
+    assert loaded.to_dict()["beyond_gamma"] == data["beyond"]
+    stored = json.loads((tmp_path / "out" / "certificate.json").read_text())
+    assert stored["beyond_gamma"] == data["beyond"]
+    kept = lm.solve(made(corner(2.5)), restrict_to_gamma=True)
+    assert kept.to_dict()["beyond_gamma"] == data["beyond"]
+    assert lm.solve(made(corner(1.5))).to_dict()["beyond_gamma"] is None
+
+
+def test_all_cells_are_no_corner():
+    found = lm.gamma_max(made(doubling()))
+    assert not found.corner
+    assert "corner" not in found.text()
+    refused = lm.solve(made(doubling(3)))
+    assert "corner" not in refused.message
+    assert refused.message.endswith("; lower gamma")
 
 
 def test_restriction_leaves_nothing():

@@ -1,0 +1,209 @@
+"""The growth of one policy, class by class: an upper bound of rho(P_u) that anyone can check.
+
+rho(P_u) is the largest spectral radius of a strongly connected class. Each class gets a positive
+vector close to its Perron vector by Noda's iteration; w is these vectors, each scaled so that what
+flows in from the classes it leads to is smaller than the slack: a factor of at most 1/slack for
+each slow class on a way to A, and no more. So a chain of tens of equal slow classes, whose values
+grow over hundreds of decades, costs one pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lmdsl import bounds, linear
+from lmdsl.lp import StabilizationLP
+
+Floats = NDArray[np.float64]
+Pairs = NDArray[np.int64]
+
+TIED = 1e-6
+"""Relative difference up to which two classes count as equally slow."""
+
+LEAST_ENTRY = 1e-250
+"""Least entry of the vector of a class whose largest is 1."""
+
+SMALLEST, LARGEST = 1e-280, 1e300
+"""Range of w."""
+
+
+@dataclass(frozen=True)
+class Growth:
+    """A policy class by class.
+
+    Attributes
+    ----------
+    pair
+        A column per cell.
+    P
+        Its rows, CSR, shape (n, n).
+    order, ends
+        Its cells by class, every class after all it leads to: see :func:`lmdsl.linear.classes`.
+    x
+        A positive vector on every class, close to the Perron vector; shape (n,).
+    rate
+        Upper bound of the spectral radius of the class of every cell, up to rounding, shape (n,).
+    """
+
+    pair: Pairs
+    P: Any
+    order: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    x: Floats
+    rate: Floats
+
+    @property
+    def limit(self) -> float:
+        """1/rho(P_u): the policy is gamma-stabilizing below it."""
+        return 1 / float(self.rate.max())
+
+    @property
+    def slowest(self) -> NDArray[np.bool_]:
+        """The cells of the classes that set the limit, shape (n,)."""
+        slowest: NDArray[np.bool_] = self.rate >= self.rate.max() * (1 - TIED)
+        return slowest
+
+    @cached_property
+    def slow_vector(self) -> Floats:
+        """The vectors of these classes, 0 elsewhere, shape (n,)."""
+        return np.where(self.slowest, self.x, 0.0)
+
+
+def of_policy(lp: StabilizationLP, pair: Pairs) -> Growth:
+    """Take a policy apart into classes and estimate the spectral radius of each."""
+    P = lp.rows.matrix(pair)
+    order, ends = linear.classes(P)
+    x, rate = np.ones(lp.n), P.diagonal()
+    lengths = np.diff(ends, prepend=0)
+    for k in np.flatnonzero(lengths > 1):
+        cells = order[ends[k] - lengths[k] : ends[k]]
+        x[cells], rate[cells] = _perron(P[cells][:, cells])
+    return Growth(pair, P, order, ends, x, rate)
+
+
+def _perron(inner: Any, steps: int = 100) -> tuple[Floats, float]:
+    """Return x > 0 and the largest (M x)_i / x_i for an irreducible M >= 0, close to rho(M).
+
+    For a bound at > rho, y = (I - M/at)^-1 x is positive and (M y)_i / y_i < at. Noda's iteration
+    takes for ``at`` the largest (M x)_i / x_i so far: it falls to rho, quadratically in the end.
+    Where it falls slowly, as it does if x spans many decades, ``at`` is taken halfway down to a
+    lower bound: the least (M x)_i / x_i, or an ``at`` that gave no positive y. Whatever x > 0 it
+    ends with, max (M x)_i / x_i >= rho holds.
+    """
+    n = inner.shape[0]
+    dense = inner.toarray() if n <= linear.DENSE else None
+    M = inner if dense is None else dense
+    x = np.ones(n)
+    ahead = M @ x
+    top, bottom = float(ahead.max()), float(ahead.min())
+    halve = False
+    for _ in range(steps):
+        width = top - bottom
+        if width <= 1e-11 * top:
+            break
+        # A little off top, so that the last steps are not singular.
+        at = (top + bottom) / 2 if halve else top * (1 + 1e-9)
+        y = _solved(M / at, x)
+        if y is None:
+            if not halve:
+                break
+            bottom = at
+            continue
+        ahead_y = M @ y
+        ratio = ahead_y / y
+        bottom = max(bottom, float(ratio.min()))
+        if ratio.max() < top:
+            x, top = y, float(ratio.max())
+        elif not halve:
+            break
+        else:
+            bottom = at  # rounding ends here
+        halve = not top - bottom < 0.1 * width
+    return x, top
+
+
+def _solved(M: Any, x: Floats) -> Floats | None:
+    """Return y = x + M y, largest entry 1, None where it is not positive or leaves doubles."""
+    if isinstance(M, np.ndarray):
+        try:
+            y: Any = np.linalg.solve(np.eye(len(x)) - M, x)
+        except np.linalg.LinAlgError:
+            return None
+    else:
+        y = linear.solve(M, x)
+    if y is None or not np.isfinite(y).all() or not y.min() > 0:
+        return None
+    y = x + M @ y  # sums of positive numbers: every entry to its own precision
+    y = y / y.max()
+    return np.asarray(y, dtype=np.float64) if y.min() >= LEAST_ENTRY else None
+
+
+def prove_low(lp: StabilizationLP, found: Growth) -> tuple[float, Floats] | None:
+    """Return a proved low of a policy and its w, with the least slack that doubles allow."""
+    P, w, rho = found.P, np.empty(lp.n), float(found.rate.max())
+
+    def fits(power: float) -> bool:
+        bound = rho * (1 + 10.0**power)
+        return bool(_scale(P.indptr, P.indices, P.data, found.order, found.ends, found.x, bound, w))
+
+    power, failed = -9.0, -9.0
+    if not fits(power):
+        power = 3.0  # where the scales do not grow any more
+        while power - failed > 0.02:
+            middle = (power + failed) / 2
+            power, failed = (middle, failed) if fits(middle) else (power, middle)
+        if not fits(power):
+            return None
+    low = check_low(lp, found.pair, w)
+    return None if low is None else (low, w)
+
+
+def check_low(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
+    """Return the largest low (rounded down) with low P_u w <= w, None where w > 0 fails."""
+    if not (np.isfinite(w).all() and (w > 0).all()):
+        return None
+    ahead = bounds.expected_above(lp, pair, w, 1.0)
+    with np.errstate(divide="ignore"):
+        ratio = w / ahead
+    return float(ratio.min()) * (1 - 4 * bounds.UNIT)
+
+
+@njit(cache=True, nogil=True)
+def _scale(indptr, indices, data, order, ends, x, bound, w):  # type: ignore[no-untyped-def]
+    """Scale the vector of each class so that P w <= bound w; False where doubles end.
+
+    Classes are met after all they lead to. In class c, with w = s x: inner + outer <= bound s x
+    asks s >= outer / (bound x - inner), inner = (P x) within the class, outer = (P w) beyond it.
+    """
+    label = np.full(len(order), -1)
+    begin = 0
+    for c in range(len(ends)):
+        for p in range(begin, ends[c]):
+            label[order[p]] = c
+        scale = 0.0
+        for p in range(begin, ends[c]):
+            i = order[p]
+            scale = max(scale, SMALLEST / x[i])
+            inner, outer = 0.0, 0.0
+            for e in range(indptr[i], indptr[i + 1]):
+                j = indices[e]
+                if label[j] == c:
+                    inner += data[e] * x[j]
+                else:
+                    outer += data[e] * w[j]
+            margin = bound * x[i] - inner
+            if margin <= 0.0:
+                return False
+            scale = max(scale, outer / margin)
+        if not scale < LARGEST:
+            return False
+        for p in range(begin, ends[c]):
+            w[order[p]] = scale * (1 + 1e-12) * x[order[p]]
+        begin = ends[c]
+    return True
