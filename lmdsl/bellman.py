@@ -5,16 +5,24 @@ One compiled loop per idea. Vectors over C carry one more entry, 0, for the attr
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lmdsl import threads
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
+T = TypeVar("T")
+
+GRAIN = 200_000
+"""Transitions that are worth a thread."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,17 @@ def padded(V: Floats) -> Floats:
     return np.append(np.asarray(V, dtype=np.float64), 0.0)
 
 
+def over_cells(lp: StabilizationLP, part: Callable[[tuple[int, int]], T]) -> list[T]:
+    """Call ``part`` on ranges of cells that cover C, in several threads where that pays.
+
+    The ranges, and so the results, do not depend on the number of threads.
+    """
+    count = max(1, min(len(lp.rows.target) // GRAIN, 64, lp.n))
+    ends = np.linspace(0, lp.n, count + 1).astype(np.int64).tolist()
+    ranges = list(pairwise(ends))
+    return [part(ranges[0])] if count == 1 else list(threads.in_order(part, ranges))
+
+
 def improve(
     lp: StabilizationLP,
     V: Floats,
@@ -54,29 +73,63 @@ def improve(
         Other than the LP's own; ``cost`` has shape (K,).
     """
     value, pair = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
-    rows = lp.rows
-    _improve(
-        lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
-        lp.cost if cost is None else cost, lp.gamma if gamma is None else gamma, padded(V),
-        value, pair,
-    )  # fmt: skip
+    rows, x = lp.rows, padded(V)
+    gamma = lp.gamma if gamma is None else gamma
+    cost = lp.cost if cost is None else cost
+
+    def part(cells: tuple[int, int]) -> None:
+        _improve(
+            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            cost, gamma, x, value, pair,
+        )  # fmt: skip
+
+    over_cells(lp, part)
+    return Improvement(value, pair)
+
+
+def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Improvement:
+    """Make a pass of value iteration under unit cost, cell by cell, staying put summed up at once.
+
+    From V <= T V the pass raises V, and it stays below the least unit cost.
+
+    Parameters
+    ----------
+    lp, V, gamma
+        The model, a value vector on C, and the weight.
+    backwards
+        The order in which the cells of a range are visited.
+    """
+    value, pair = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
+    rows, x = lp.rows, padded(V)
+
+    def part(cells: tuple[int, int]) -> None:
+        _rise(
+            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            gamma, x, backwards, value, pair,
+        )  # fmt: skip
+
+    over_cells(lp, part)
     return Improvement(value, pair)
 
 
 def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDArray[np.bool_]:
     """Return the columns with Q <= Q_min + tolerance |Q_min|, shape (K,)."""
     ties = np.empty(lp.K, dtype=np.bool_)
-    rows = lp.rows
-    _tied(
-        lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
-        lp.cost, lp.gamma, padded(V), best + tolerance * np.abs(best), ties,
-    )  # fmt: skip
+    rows, x, limit = lp.rows, padded(V), best + tolerance * np.abs(best)
+
+    def part(cells: tuple[int, int]) -> None:
+        _tied(
+            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            lp.cost, lp.gamma, x, limit, ties,
+        )  # fmt: skip
+
+    over_cells(lp, part)
     return ties
 
 
 @njit(cache=True, nogil=True)
-def _improve(pair_pointer, pointer, target, code, share, cost, gamma, V, value, pair):  # type: ignore[no-untyped-def]
-    for i in range(len(pair_pointer) - 1):
+def _improve(first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, value, pair):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
         best, choice = np.inf, -1
         for k in range(pair_pointer[i], pair_pointer[i + 1]):
             q = 0.0
@@ -89,10 +142,34 @@ def _improve(pair_pointer, pointer, target, code, share, cost, gamma, V, value, 
 
 
 @njit(cache=True, nogil=True)
-def _tied(pair_pointer, pointer, target, code, share, cost, gamma, V, limit, ties):  # type: ignore[no-untyped-def]
-    for i in range(len(pair_pointer) - 1):
+def _tied(first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, limit, ties):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
         for k in range(pair_pointer[i], pair_pointer[i + 1]):
             q = 0.0
             for e in range(pointer[k], pointer[k + 1]):
                 q += share[code[e]] * V[target[e]]
             ties[k] = gamma * q + cost[k] <= limit[i]
+
+
+@njit(cache=True, nogil=True)
+def _rise(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, gamma, V, backwards, value, pair
+):
+    for i in range(first, last):
+        value[i] = V[i]
+    for t in range(last - first):
+        i = last - 1 - t if backwards else first + t
+        best, choice = np.inf, pair_pointer[i]
+        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+            own, q = 0.0, 1.0
+            for e in range(pointer[k], pointer[k + 1]):
+                j = target[e]
+                if j == i:
+                    own += gamma * share[code[e]]
+                else:
+                    q += gamma * share[code[e]] * (value[j] if first <= j < last else V[j])
+            if own < 1.0:
+                q /= 1.0 - own
+                if q < best:
+                    best, choice = q, k
+        value[i], pair[i] = max(best, value[i]), choice

@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lmdsl.bellman import padded
+from lmdsl.bellman import over_cells, padded
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -56,11 +56,16 @@ def add_above(a: Floats, b: Floats) -> Floats:
 
 def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Floats:
     """Return a lower bound of min_a gamma P_a x + G_a, shape (n,); ``cost`` None means 0."""
-    lower, rows = np.empty(lp.n), lp.rows
-    _below(
-        lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value, gamma,
-        np.empty(0) if cost is None else cost, padded(x), lower,
-    )  # fmt: skip
+    lower, rows, V = np.empty(lp.n), lp.rows, padded(x)
+    cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
+
+    def part(cells: tuple[int, int]) -> None:
+        _below(
+            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            gamma, cost, V, plain, lower,
+        )  # fmt: skip
+
+    over_cells(lp, part)
     return lower
 
 
@@ -74,12 +79,21 @@ def holds_for_all(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | N
 
 def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Pairs | None:
     """Return the pairs for which x <= gamma P_a x + G_a is not clear; None if too many."""
-    found, rows = np.empty(MAX_EXACT, dtype=np.int64), lp.rows
-    count = _open(
-        lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value, gamma,
-        np.empty(0) if cost is None else cost, padded(x), found,
-    )  # fmt: skip
-    return None if count > MAX_EXACT else found[:count]
+    rows, V = lp.rows, padded(x)
+    cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
+
+    def part(cells: tuple[int, int]) -> tuple[int, Pairs]:
+        found = np.empty(MAX_EXACT, dtype=np.int64)
+        count = _open(
+            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            gamma, cost, V, plain, found,
+        )  # fmt: skip
+        return int(count), found[:count].copy()
+
+    parts = over_cells(lp, part)
+    if sum(count for count, _ in parts) > MAX_EXACT:
+        return None
+    return np.concatenate([found for _, found in parts])
 
 
 def exact_backup(
@@ -182,6 +196,33 @@ def _rounded_down(value: Fraction) -> float:
     return near if Fraction(near) <= value else float(np.nextafter(near, -np.inf))
 
 
+def tame(lp: StabilizationLP, V: Floats, gamma: float) -> bool:
+    """Return whether every product gamma share V is 0 or a normal double: none underflows."""
+    positive = V[V > 0]
+    if not len(positive):
+        return True
+    share = lp.rows.shares.value
+    return float(positive.min()) * float(share.min()) * min(gamma, 1.0) > 1e-290
+
+
+def worst_excess(lp: StabilizationLP, V: Floats) -> tuple[float, bool]:
+    """Return max r_a / G_a over pairs with G_a > 0, and whether r_a > 0 where G_a = 0.
+
+    r_a = max(0, V - lower bound of gamma P_a V - G_a), rounded up.
+    """
+    rows, x, plain = lp.rows, padded(V), tame(lp, V, lp.gamma)
+
+    def part(cells: tuple[int, int]) -> tuple[float, bool]:
+        worst, stuck = _excess(
+            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            lp.gamma, lp.cost, x, plain,
+        )  # fmt: skip
+        return float(worst), bool(stuck)
+
+    found = over_cells(lp, part)
+    return max(worst for worst, _ in found), any(stuck for _, stuck in found)
+
+
 @njit(cache=True, nogil=True)
 def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def]
     """The sum (P V)_k, its relative and its absolute rounding error.
@@ -201,9 +242,15 @@ def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def _bound_below(k, pointer, target, code, share, gamma, cost, V):  # type: ignore[no-untyped-def]
+def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: ignore[no-untyped-def]
+    """A lower bound of gamma (P V)_k + g; ``plain`` where no product underflows."""
+    if plain:
+        q = 0.0
+        for e in range(pointer[k], pointer[k + 1]):
+            q += share[code[e]] * V[target[e]]
+        relative = (pointer[k + 1] - pointer[k] + 8) * UNIT
+        return max((gamma * (q * (1.0 - relative)) + g) * (1.0 - 4.0 * UNIT), g)
     q, relative, absolute = _product(k, pointer, target, code, share, V)
-    g = cost[k] if len(cost) else 0.0
     if absolute == 0.0:
         return g
     future = gamma * max(q * (1.0 - relative) - absolute, 0.0)
@@ -222,22 +269,28 @@ def _above(pair, pointer, target, code, share, gamma, V, upper):  # type: ignore
 
 
 @njit(cache=True, nogil=True)
-def _below(pair_pointer, pointer, target, code, share, gamma, cost, V, lower):  # type: ignore[no-untyped-def]
-    for i in range(len(pair_pointer) - 1):
+def _below(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain, lower
+):
+    for i in range(first, last):
         best = np.inf
         for k in range(pair_pointer[i], pair_pointer[i + 1]):
-            q = _bound_below(k, pointer, target, code, share, gamma, cost, V)
+            g = cost[k] if len(cost) else 0.0
+            q = _bound_below(k, pointer, target, code, share, gamma, g, V, plain)
             if q < best:
                 best = q
         lower[i] = best
 
 
 @njit(cache=True, nogil=True)
-def _open(pair_pointer, pointer, target, code, share, gamma, cost, V, found):  # type: ignore[no-untyped-def]
+def _open(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain, found
+):
     count = 0
-    for i in range(len(pair_pointer) - 1):
+    for i in range(first, last):
         for k in range(pair_pointer[i], pair_pointer[i + 1]):
-            if V[i] > _bound_below(k, pointer, target, code, share, gamma, cost, V):
+            g = cost[k] if len(cost) else 0.0
+            if V[i] > _bound_below(k, pointer, target, code, share, gamma, g, V, plain):
                 if count < len(found):
                     found[count] = k
                 count += 1
@@ -245,15 +298,14 @@ def _open(pair_pointer, pointer, target, code, share, gamma, cost, V, found):  #
 
 
 @njit(cache=True, nogil=True)
-def worst_excess(pair_pointer, pointer, target, code, share, gamma, cost, V):  # type: ignore[no-untyped-def]
-    """Return max r_a / G_a over pairs with G_a > 0, and whether r_a > 0 where G_a = 0.
-
-    r_a = max(0, V - lower bound of gamma P_a V - G_a), rounded up.
-    """
+def _excess(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain
+):
     worst, stuck = 0.0, False
-    for i in range(len(pair_pointer) - 1):
+    for i in range(first, last):
         for k in range(pair_pointer[i], pair_pointer[i + 1]):
-            excess = V[i] - _bound_below(k, pointer, target, code, share, gamma, cost, V)
+            below = _bound_below(k, pointer, target, code, share, gamma, cost[k], V, plain)
+            excess = V[i] - below
             if excess > 0.0:
                 if cost[k] > 0.0:
                     worst = max(worst, excess / cost[k] * (1.0 + 4.0 * UNIT))

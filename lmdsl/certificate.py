@@ -142,10 +142,10 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
     """
     if not (np.isfinite(mu).all() and (mu >= 0).all()):
         return math.inf
-    P = lp.rows.matrix(pair).T.tocsr()
+    P = lp.rows.matrix(pair)
     with np.errstate(over="ignore", invalid="ignore"):
-        inflow = lp.gamma * (P @ mu)
-        entries = np.diff(P.indptr)
+        inflow = lp.gamma * (P.T @ mu)
+        entries = np.bincount(P.indices, minlength=lp.n)
         rounding = (entries + 8) * bounds.UNIT * (lp.weight + mu + inflow)
         rounding += (1 + lp.gamma) * (entries + 8) * bounds.LEAST * (1 + mu.max(initial=0.0))
         residual = np.abs((lp.weight - mu) + inflow)

@@ -1,18 +1,19 @@
 """Solving x = b + M x for a nonnegative sparse M: the evaluation of a fixed policy.
 
 For b >= 0 the smallest nonnegative solution is sum M^k b, finite for every b exactly when the
-spectral radius of M is below 1. Jacobi sweeps from 0 rise to it and keep every iterate >= 0. Where
-they converge slowly the system is solved directly, class by class: the strongly connected classes
-of M are visited in an order in which everything a class leads to is known, single cells by
-substitution, larger classes by sparse LU. Values may then span hundreds of decades, as a chain of
-slow classes makes them do, and each class is still solved to its own precision. Whether an answer
-is good enough is judged by the certificate.
+spectral radius of M is below 1. Gauss-Seidel sweeps converge to it, from any x >= 0, at least as
+fast as Jacobi's, and keep every iterate >= 0. Where they converge slowly the system is solved
+directly, class by class: the strongly connected classes of M are visited in an order in which
+everything a class leads to is known, single cells by substitution, larger classes by sparse LU.
+Values may then span hundreds of decades, as a chain of slow classes makes them do, and each class
+is still solved to its own precision. Whether an answer is good enough is judged by the certificate.
 """
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,9 +28,52 @@ MAX_FACTORED = 100_000
 DENSE = 50
 TOLERANCE = 2e-15
 CEILING = 1e305
+NEVER = 1e308
 
 
-def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
+@dataclass(frozen=True)
+class System:
+    """x = b + M x with the diagonal solved for: x_i = (b_i + sum over j != i of M_ij x_j) / own_i.
+
+    Attributes
+    ----------
+    indptr, indices, data
+        The rows of M without its diagonal.
+    inverse
+        1 / (1 - M_ii), huge where M_ii >= 1: no finite x_i > 0 satisfies such a row.
+    b
+        Shape (n,), entries >= 0.
+    """
+
+    indptr: NDArray[np.int64]
+    indices: NDArray[np.int32]
+    data: Floats
+    inverse: Floats
+    b: Floats
+
+    @classmethod
+    def of(cls, M: Any, b: Floats) -> System:
+        """Split a CSR array."""
+        n, entries = len(b), len(M.data)
+        indptr = np.empty(n + 1, dtype=np.int64)
+        indices, data = np.empty(entries, dtype=np.int32), np.empty(entries)
+        inverse = np.empty(n)
+        _split(M.indptr, M.indices, M.data, indptr, indices, data, inverse)
+        return cls(indptr, indices, data, inverse, b)
+
+    def sweep(
+        self, x: Floats, count: int, enough: float = TOLERANCE, flat: float = 0.0
+    ) -> tuple[float, float]:
+        """Make Gauss-Seidel sweeps in place; see :func:`_gauss_seidel`."""
+        halfway, last = _gauss_seidel(
+            self.indptr, self.indices, self.data, self.inverse, self.b, x, count, enough, flat
+        )
+        return float(halfway), float(last)
+
+
+def solve(
+    M: Any, b: Floats, start: Floats | None = None, enough: float = TOLERANCE
+) -> Floats | None:
     """Return x >= 0 with x = b + M x, or None where there is none (as far as rounding can tell).
 
     Parameters
@@ -40,20 +84,29 @@ def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
         Shape (n,), entries >= 0.
     start
         A guess, shape (n,), >= 0.
+    enough
+        Relative change of a sweep that ends the work.
     """
     x = np.array(b if start is None else start, dtype=np.float64)
     if (b == 0).any():
         x[~_pays(M, b)] = 0.0  # exactly: a guess would only fade there
-    x, change, rate = _sweep(M, b, x, TRIAL_SWEEPS)
-    if change <= TOLERANCE:
+    return solve_from(System.of(M, b), x, lambda: M, enough)
+
+
+def solve_from(
+    system: System, x: Floats, matrix: Callable[[], Any], enough: float = TOLERANCE
+) -> Floats | None:
+    """Solve from a guess, which is overwritten; ``matrix`` makes M where sweeps are slow."""
+    change, rate = _trial(system, x, enough)
+    if change <= enough:
         return x
     if not _soon(change, rate):
-        direct, small_enough = solve_by_class(M, b)
+        direct, small_enough = solve_by_class(matrix(), system.b)
         if direct is not None or small_enough:
             return direct
     for _ in range(MAX_SWEEPS // TRIAL_SWEEPS):
-        x, change, rate = _sweep(M, b, x, TRIAL_SWEEPS)
-        if change <= TOLERANCE:
+        change, rate = _trial(system, x, enough)
+        if change <= enough:
             return x
         if not np.isfinite(change) or x.max() > CEILING:
             return None
@@ -70,22 +123,16 @@ def _pays(M: Any, b: Floats) -> NDArray[np.bool_]:
 
 
 def _soon(change: float, rate: float) -> bool:
-    return rate < 1 and np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < 300
+    if not (change < np.inf and rate < 1):
+        return False
+    return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < 300)
 
 
-def _sweep(M: Any, b: Floats, x: Floats, count: int) -> tuple[Floats, float, float]:
-    """Sweep; return x, its last relative change, and the factor by which a sweep shrinks it."""
-    halfway = last = np.inf
-    with np.errstate(all="ignore"):
-        for k in range(count):
-            y = b + M @ x
-            if k in (count // 2, count - 1):
-                top = float(y.max(initial=0.0))
-                relative = np.abs(y - x) / np.maximum(y, 1e-14 * top + 1e-300)
-                halfway, last = last, float(relative.max(initial=0.0))
-            x = y
-    rate = (last / halfway) ** (2 / count) if 0 < halfway < np.inf else 0.0
-    return x, last, rate
+def _trial(system: System, x: Floats, enough: float) -> tuple[float, float]:
+    """Sweep; return the last relative change, and the factor by which a sweep shrinks it."""
+    halfway, last = system.sweep(x, TRIAL_SWEEPS, enough)
+    rate = (last / halfway) ** (2 / TRIAL_SWEEPS) if 0 < halfway < np.inf else 0.0
+    return last, rate
 
 
 def solve_by_class(M: Any, b: Floats) -> tuple[Floats | None, bool]:
@@ -166,6 +213,66 @@ def _factors(inner: Any) -> Callable[[Floats], Floats]:
 def _dense(inner: Any) -> Callable[[Floats], Floats]:
     system = np.eye(inner.shape[0]) - inner.toarray()
     return lambda known: np.linalg.solve(system, known)
+
+
+@njit(cache=True, nogil=True)
+def _split(indptr, indices, data, out_indptr, out_indices, out_data, inverse):  # type: ignore[no-untyped-def]
+    used = 0
+    out_indptr[0] = 0
+    for i in range(len(inverse)):
+        own = 0.0
+        for e in range(indptr[i], indptr[i + 1]):
+            if indices[e] == i:
+                own += data[e]
+            else:
+                out_indices[used] = indices[e]
+                out_data[used] = data[e]
+                used += 1
+        inverse[i] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
+        out_indptr[i + 1] = used
+
+
+@njit(cache=True, nogil=True)
+def _gauss_seidel(indptr, indices, data, inverse, b, x, count, enough, flat):  # type: ignore[no-untyped-def]
+    """Sweep over the components, forwards and backwards in turn, using each as soon as known.
+
+    Staying put is summed up at once, so a chain of slow cells takes one sweep in its direction.
+    From x >= b + M x every sweep lowers x, from below it raises it. Returns the largest relative
+    change of the sweep halfway and of the last one; ends early where that is at most ``enough``,
+    where no component moved by more than ``flat``, or where x is no longer finite.
+    """
+    n = len(b)
+    halfway, change, top = np.inf, np.inf, 0.0
+    for sweep in range(count):
+        measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
+        if not measured:
+            for t in range(n):
+                i = t if sweep % 2 == 0 else n - 1 - t
+                y = b[i]
+                for e in range(indptr[i], indptr[i + 1]):
+                    y += data[e] * x[indices[e]]
+                x[i] = y * inverse[i]
+            continue
+        floor, top, change, most = 1e-14 * top + 1e-300, 0.0, 0.0, 0.0
+        for t in range(n):
+            i = t if sweep % 2 == 0 else n - 1 - t
+            y = b[i]
+            for e in range(indptr[i], indptr[i + 1]):
+                y += data[e] * x[indices[e]]
+            y *= inverse[i]
+            moved = abs(y - x[i])
+            if moved > change * max(y, floor):
+                change = moved / max(y, floor)
+            most = max(most, moved)
+            top = max(top, y)
+            x[i] = y
+        if not top < CEILING:
+            return halfway, np.inf
+        if sweep == count // 2:
+            halfway = change
+        if change <= enough or most <= flat:
+            break
+    return halfway, change
 
 
 @njit(cache=True, nogil=True)

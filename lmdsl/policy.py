@@ -16,10 +16,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bellman, bounds, graph, linear
 from lmdsl.lp import StabilizationLP
+from lmdsl.screening import Pass, Screen
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
@@ -29,6 +31,8 @@ Stop = Callable[[], bool]
 TIE = 1e-12
 """Relative difference in Q up to which two controls count as tied."""
 
+LEAST_SWEEPS, MOST_SWEEPS = 4, 60
+
 
 def evaluate(
     lp: StabilizationLP,
@@ -36,6 +40,7 @@ def evaluate(
     gamma: float | None = None,
     cost: Floats | None = None,
     start: Floats | None = None,
+    transient: bool = False,
 ) -> Floats | None:
     """Return V = G_u + gamma P_u V, shape (n,); None where the policy has no finite value.
 
@@ -47,19 +52,47 @@ def evaluate(
         Other than the LP's own; ``cost`` has shape (K,).
     start
         A guess of V.
+    transient
+        The policy is known to be gamma-stabilizing, which saves looking whether it reaches A.
     """
     gamma = lp.gamma if gamma is None else gamma
-    cost = lp.cost if cost is None else cost
-    P = lp.rows.matrix(pair)
-    if gamma >= 1 and not reaches_attractor(lp, pair, P).all():
+    b = (lp.cost if cost is None else cost)[pair]
+    if gamma >= 1 and not transient and not reaches_attractor(lp, pair).all():
         return None
-    return linear.solve(gamma * P, cost[pair], start)
+    if (b == 0).any():
+        return linear.solve(gamma * lp.rows.matrix(pair), b, start)
+    x = np.array(b if start is None else start, dtype=np.float64)
+    system = lp.rows.system(pair, gamma, b)
+    return linear.solve_from(system, x, lambda: gamma * lp.rows.matrix(pair))
 
 
-def reaches_attractor(lp: StabilizationLP, pair: Pairs, P: object | None = None) -> Bools:
+def reaches_attractor(lp: StabilizationLP, pair: Pairs) -> Bools:
     """Return the cells from which the policy can reach A, shape (n,)."""
-    level, _ = graph.tree(np.arange(lp.n + 1, dtype=np.int64), lp.rows.take(pair))
-    return level >= 0
+    reaches = np.zeros(lp.n + 1, dtype=np.bool_)
+    reaches[-1] = True
+    if not _reach(pair, lp.rows.pointer, lp.rows.target, reaches, 64):
+        level, _ = graph.tree(np.arange(lp.n + 1, dtype=np.int64), lp.rows.take(pair))
+        return level >= 0
+    return reaches[:-1]
+
+
+@njit(cache=True, nogil=True)
+def _reach(pair, pointer, target, reaches, sweeps):  # type: ignore[no-untyped-def]
+    """Mark cells with a marked successor until nothing changes; False where sweeps run out."""
+    n = len(pair)
+    for sweep in range(sweeps):
+        changed = False
+        for t in range(n):
+            i = t if sweep % 2 == 0 else n - 1 - t
+            if reaches[i]:
+                continue
+            for e in range(pointer[pair[i]], pointer[pair[i] + 1]):
+                if reaches[target[e]]:
+                    reaches[i] = changed = True
+                    break
+        if not changed:
+            return True
+    return False
 
 
 @dataclass(frozen=True)
@@ -74,12 +107,15 @@ class Iteration:
         Improvement steps that changed the policy.
     converged
         False when stopped early.
+    screen
+        Lower bounds of every Q at the value.
     """
 
     pair: Pairs
     value: Floats
     steps: int
     converged: bool
+    screen: Screen
 
 
 def iterate(
@@ -91,35 +127,78 @@ def iterate(
     stop: Stop = lambda: False,
     limit: int | None = None,
 ) -> Iteration:
-    """Howard's policy iteration from a policy and its value.
+    """Policy iteration from a gamma-stabilizing policy until no control is better.
 
-    The k-th step makes k improvement sweeps before it evaluates, so that news from A travels
-    further than one cell a step. Each sweep lowers V where a control is strictly better and keeps
-    that control: T_u V <= V stays true, with equality on no recurrent class that was changed.
+    Parameters
+    ----------
+    lp, pair
+        The model and the first policy.
+    value
+        Its value, or any V >= T_u V, such as :func:`bound` gives.
+    gamma, cost
+        Other than the LP's own; ``cost`` has shape (K,).
+    stop, limit
+        Asked before every step; largest number of steps.
+
+    Notes
+    -----
+    Each step changes every control for which another one is better by a relative 1e-12, then sweeps
+    V <- T_u V for the new policy u, about as long as the improvement took; only a policy that seems
+    final is evaluated to the end. V >= T_u V stays true whatever the number of sweeps, so V falls
+    and every policy on the way is gamma-stabilizing (docs/mathematics.md, Policy iteration).
     """
-    step = 0
+    screen = Screen(lp, gamma, cost)
+    gamma, cost = screen.gamma, screen.cost
+    V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
     while True:
-        if stop() or step == limit:
-            return Iteration(pair, value, step, False)
-        new, lowered = pair, value
-        for _ in range(step + 1):
-            better = bellman.improve(lp, lowered, gamma, cost)
-            change = (better.value < lowered - TIE * np.abs(lowered)) & (better.pair != new)
-            if not change.any():
-                break
-            new = np.where(change, better.pair, new)
-            lowered = np.where(change, better.value, lowered)
-        if new is pair:
-            return Iteration(pair, value, step, True)
-        new_value = evaluate(lp, new, gamma, cost, lowered)
-        if new_value is None or not (new_value < value).any():
+        out = stop() or step == limit
+        done = screen.improve(V, pair, TIE) if not out else Pass(V, pair, 0, 0)
+        if done.changed:
+            x = done.value.copy()
+            sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
+            enough = 0.1 * _fall(V, x)
+            lp.rows.system(done.pair, gamma, cost[done.pair]).sweep(x, sweeps, enough)
+            x = np.minimum(x, done.value)
+            screen.follow(V, x)
+            pair, V = done.pair, x
+            step += 1
+            continue
+        if last is not None and last[0] is pair:
+            return Iteration(*last, step, not out, screen)
+        exact = evaluate(lp, pair, gamma, cost, done.value, transient=True)
+        if exact is None:
+            exact = evaluate(lp, pair, gamma, cost)
+        if exact is None or (last is not None and not (exact < last[1]).any()):
             # Rounding made a change look better than it is.
-            return Iteration(pair, value, step, True)
-        pair, value = new, new_value
-        step += 1
+            return Iteration(*(last or (pair, V)), step, last is not None and not out, screen)
+        screen.follow(V, np.minimum(exact, V))
+        last, V = (pair, exact), exact
+        if out:
+            return Iteration(*last, step, False, screen)
 
 
-def canonical(lp: StabilizationLP, pair: Pairs, value: Floats) -> Pairs:
+def _fall(before: Floats, after: Floats) -> float:
+    """Return the largest relative decrease."""
+    ratio = np.divide(after, before, out=np.ones(len(before)), where=before > 0)
+    return 1.0 - float(ratio.min(initial=1.0))
+
+
+def bound(lp: StabilizationLP, pair: Pairs, w: Floats | None = None) -> Floats | None:
+    """Return V >= T_u V of a g-stabilizing policy, None where none is found quickly.
+
+    With w >= g P_u w + d, c w serves as soon as c d >= G_u.
+    """
+    w, d = stability_vector(lp, pair, w)
+    if w is None or d is None:
+        return None
+    with np.errstate(over="ignore"):
+        V: Floats = w * (float((lp.cost[pair] / d).max()) * (1 + 1e-12))
+    return V if (V < linear.CEILING).all() else None
+
+
+def canonical(
+    lp: StabilizationLP, pair: Pairs, value: Floats, screen: Screen | None = None
+) -> Pairs:
     """Break ties so that the policy reaches A: the policy that every backend ends with.
 
     Tied are the columns with Q <= Q_min + 1e-12 |Q_min|. Among them take those optimal for unit
@@ -130,9 +209,12 @@ def canonical(lp: StabilizationLP, pair: Pairs, value: Floats) -> Pairs:
     ----------
     lp, pair, value
         The model, an optimal policy and its value.
+    screen
+        Lower bounds of every Q at this value, where they are known.
     """
-    best = bellman.improve(lp, value).value
-    ties = bellman.tied(lp, value, best, TIE)
+    if screen is None:
+        screen = Screen(lp)
+    ties = screen.tied(value, TIE)
     ties[pair] = True
     choices = np.add.reduceat(ties, lp.pair_pointer[:-1], dtype=np.int64)
     first = first_column(lp, ties)
@@ -177,21 +259,31 @@ def _columns(lp: StabilizationLP, allowed: Bools):  # type: ignore[no-untyped-de
 
 
 def stability_vector(
-    lp: StabilizationLP, pair: Pairs, guess: Floats | None = None, g: float | None = None
+    lp: StabilizationLP,
+    pair: Pairs,
+    guess: Floats | None = None,
+    g: float | None = None,
+    sharp: bool = False,
 ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return w > 0, d > 0 with w >= g P_u w + d: a proof that the policy is g-stabilizing.
 
-    w is the unit-cost value. Where it spans so many decades that 1 is lost in rounding, the value
-    at a slightly larger weight leaves a relative slack instead.
+    w is close to the unit-cost value, closer where ``sharp``. Where that spans so many decades that
+    1 is lost in rounding, the value at a slightly larger weight leaves a relative slack instead.
     """
     g = lp.growth if g is None else g
-    unit = np.ones(lp.K)
     if guess is not None and (d := bounds.decrease(lp, pair, guess, g)) is not None:
         return guess, d
-    for inflation in (0.0, 5e-7, 1e-10):
-        w = evaluate(lp, pair, g * (1 + inflation), unit, guess)
-        if w is not None and (d := bounds.decrease(lp, pair, w, g)) is not None:
+    unit = np.ones(lp.n)
+    w = unit.copy()
+    # Sweeps from below leave 1 + g P w - w at most what they still move.
+    if lp.rows.system(pair, g, unit).sweep(w, 128, 0.0, 1e-6 if sharp else 0.25)[1] < np.inf:
+        d = bounds.decrease(lp, pair, w, g)
+        if d is not None:
             return w, d
+    for inflation in (0.0, 5e-7, 1e-10):
+        w_more = evaluate(lp, pair, g * (1 + inflation), np.ones(lp.K), guess)
+        if w_more is not None and (d := bounds.decrease(lp, pair, w_more, g)) is not None:
+            return w_more, d
     return None, None
 
 
@@ -226,22 +318,42 @@ class Undecided:
     lower: float
 
 
+def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
+    """Sweep a guess of the unit-cost value until it proves a policy g-stabilizing, a while."""
+    w = w.copy()
+    lp.rows.system(pair, lp.growth, np.ones(lp.n)).sweep(w, MOST_SWEEPS, 0.0, 0.25)
+    return w if bounds.decrease(lp, pair, w, lp.growth) is not None else None
+
+
 def stabilizing(lp: StabilizationLP, stop: Stop = lambda: False) -> Feasible | Refused | Undecided:
     """Find a policy that is stabilizing with weight g = max(gamma, 1), or a proof against it.
 
-    Algorithm 1 gives the first policy. Where it does not do, gamma is raised from 1/2 in steps,
-    each below the limit of the last policy, under unit cost (under a cost with zeros this can
-    stall).
+    Candidates are the greedy policies of value iteration under unit cost from the levels of
+    Algorithm 1, which lie below it, then optimal policies under unit cost at gamma = 1 - 1/h, at
+    which no policy costs more than h. Where none does, gamma is raised in steps, each below the
+    limit of the last policy (unit cost, because under a cost with zeros this can stall).
     """
     g, unit = lp.growth, np.ones(lp.K)
-    pair = lp.tree[1]
-    w, _ = stability_vector(lp, pair)
-    if w is not None:
-        return Feasible(pair, w)
-    # The tree can be exponentially slow; at gamma = 1/2 every policy has a value, at most 2.
-    at, value = 0.5, evaluate(lp, pair, 0.5, unit)
-    if value is None:
-        return Undecided(pair, 0.0)
+    level, pair = lp.tree
+    V = level.astype(np.float64)
+    for k in range(4):
+        better = bellman.rise(lp, V, g, k % 2 == 1)
+        V = better.value
+        w = _proved(lp, better.pair, V) if k in (0, 3) else None
+        if w is not None:
+            return Feasible(better.pair, w)
+    for horizon in (4.0 * level.max(), 64.0 * level.max()):
+        at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
+        for _ in range(4):
+            done = iterate(lp, pair, value, at, unit, stop=stop, limit=6)
+            pair, value = done.pair, done.value
+            w = _proved(lp, pair, value)
+            if w is not None:
+                return Feasible(pair, w)
+            if stop():
+                return Undecided(pair, at)
+            if done.converged:
+                break
     refuse_at = 0
     for step in range(200):
         done = iterate(lp, pair, value, at, unit, stop=stop)

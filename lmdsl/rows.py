@@ -18,8 +18,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
+from lmdsl.linear import NEVER, System
 from lmdsl.sampling import Nodes
 
 
@@ -35,11 +37,14 @@ class Shares:
         Exact integer; ``numerator[code] / total`` is the exact share.
     value
         The same as doubles, shape (codes,), each correctly rounded.
+    merged
+        Every target occurs at most once in a row.
     """
 
     numerator: Sequence[int]
     total: int
     value: NDArray[np.float64]
+    merged: bool = False
 
     def __post_init__(self) -> None:
         freeze(self.value)
@@ -49,7 +54,7 @@ class Shares:
         """Return the codes of ``points`` sample points times noise nodes."""
         if len(nodes.weights) == 1:
             codes = points
-            return cls(range(1, codes + 1), codes, np.arange(1, codes + 1) / codes)
+            return cls(range(1, codes + 1), codes, np.arange(1, codes + 1) / codes, merged=True)
         exact: list[Fraction] = []
         sizes = np.bincount(nodes.group)
         for weight, size in zip(nodes.group_weights(), sizes, strict=True):
@@ -117,6 +122,18 @@ class Rows:
         entry = np.repeat(self.pointer[rows] - pointer[:-1], length) + np.arange(pointer[-1])
         return Rows(pointer, self.target[entry], self.code[entry], self.shares, self.columns)
 
+    def system(self, rows: NDArray[np.int64], gamma: float, b: NDArray[np.float64]) -> System:
+        """Return x = b + gamma P x for one row per column, ready for sweeps."""
+        entries = int((self.pointer[rows + 1] - self.pointer[rows]).sum())
+        indptr = np.empty(len(rows) + 1, dtype=np.int64)
+        indices, data = np.empty(entries, dtype=np.int32), np.empty(entries)
+        inverse = np.empty(len(rows))
+        used = _gather_split(
+            rows, self.pointer, self.target, self.code, self.shares.value, self.columns, gamma,
+            indptr, indices, data, inverse,
+        )  # fmt: skip
+        return System(indptr, indices[:used], data[:used], inverse, b)
+
     def matrix(self, rows: NDArray[np.integer] | None = None):  # type: ignore[no-untyped-def]
         """Return rows as a SciPy CSR array of doubles, shape (len(rows), columns).
 
@@ -124,16 +141,59 @@ class Rows:
         """
         from scipy.sparse import csr_array
 
-        chosen = self if rows is None else self.take(rows)
-        target, value = chosen.target, self.shares.value[chosen.code]
-        inside = target < self.columns
-        pointer = chosen.pointer
-        kept = np.concatenate([[0], np.cumsum(inside)])[pointer]
-        matrix = csr_array(
-            (value[inside], target[inside], kept), shape=(len(pointer) - 1, self.columns)
-        )
-        matrix.sum_duplicates()
+        chosen = np.arange(self.count) if rows is None else np.asarray(rows, dtype=np.int64)
+        length = self.pointer[chosen + 1] - self.pointer[chosen]
+        pointer = np.zeros(len(chosen) + 1, dtype=np.int64)
+        np.cumsum(length, out=pointer[1:])
+        small = pointer[-1] < 2**31  # SciPy converts other mixtures of types again and again
+        indptr = np.empty(len(chosen) + 1, dtype=np.int32 if small else np.int64)
+        indices = np.empty(int(pointer[-1]), dtype=indptr.dtype)
+        data = np.empty(int(pointer[-1]))
+        used = _gather(
+            chosen, self.pointer, self.target, self.code, self.shares.value, self.columns,
+            indptr, indices, data,
+        )  # fmt: skip
+        matrix = csr_array((data[:used], indices[:used], indptr), shape=(len(chosen), self.columns))
+        if not self.shares.merged:
+            matrix.sum_duplicates()
         return matrix
+
+
+@njit(cache=True, nogil=True)
+def _gather(rows, pointer, target, code, share, columns, indptr, indices, data):  # type: ignore[no-untyped-def]
+    """Copy rows without the attractor's share into the arrays of a CSR matrix."""
+    used = 0
+    indptr[0] = 0
+    for r in range(len(rows)):
+        for e in range(pointer[rows[r]], pointer[rows[r] + 1]):
+            if target[e] < columns:
+                indices[used] = target[e]
+                data[used] = share[code[e]]
+                used += 1
+        indptr[r + 1] = used
+    return used
+
+
+@njit(cache=True, nogil=True)
+def _gather_split(  # type: ignore[no-untyped-def]
+    rows, pointer, target, code, share, columns, gamma, indptr, indices, data, inverse
+):
+    """Copy rows without the attractor's share and without the diagonal, which is solved for."""
+    used = 0
+    indptr[0] = 0
+    for r in range(len(rows)):
+        own = 0.0
+        for e in range(pointer[rows[r]], pointer[rows[r] + 1]):
+            j = target[e]
+            if j == r:
+                own += gamma * share[code[e]]
+            elif j < columns:
+                indices[used] = j
+                data[used] = gamma * share[code[e]]
+                used += 1
+        inverse[r] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
+        indptr[r + 1] = used
+    return used
 
 
 def freeze(*arrays: NDArray[Any]) -> None:

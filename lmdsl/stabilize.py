@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -116,6 +117,7 @@ def solve(
         max_iterations=max_iterations,
         algorithm=algorithm,
         start=first.pair,
+        proof=first.w if isinstance(first, policy.Feasible) else None,
         progress=progress,
     )
     if isinstance(first, policy.Undecided):
@@ -243,30 +245,47 @@ def _polish(
     A policy that is not g-stabilizing is discarded where gamma >= 1. After a limit the policy is
     left as it is: a limit is not a license to go on.
     """
+    details = solution.details if isinstance(solution.details, Mapping) else {}
+    done = details.get("iteration")
+    if solution.stop.success and isinstance(
+        done, policy.Iteration
+    ):  # our own: it ends exactly where polishing would begin
+        return _tidied(lp, done, tolerance, 0, None)
     pair = _claimed(lp, solution)
-    if pair is not None and not _usable(lp, pair):
+    if pair is not None and not _usable(lp, pair, solution.value):
         pair = None
     if pair is None:
         pair = start
-    value = policy.evaluate(lp, pair, start=None if solution.pair is None else solution.value)
+    guess = None if solution.pair is None else solution.value
+    value = policy.evaluate(lp, pair, start=guess, transient=lp.gamma >= 1)
     if value is None or solution.stop.limit:
         return _Outcome(pair, value, 0, None)
     done = policy.iterate(lp, pair, value, stop=stop)
     gap_before = None
     if done.steps:
         gap_before = certify(lp, pair, tolerance, value).certificate.gap
-    tidy = policy.canonical(lp, done.pair, done.value)
-    if (tidy != done.pair).any() and _usable(lp, tidy):
-        tidy_value = policy.evaluate(lp, tidy, start=done.value)
+    return _tidied(lp, done, tolerance, done.steps, gap_before)
+
+
+def _tidied(
+    lp: StabilizationLP,
+    done: policy.Iteration,
+    tolerance: float,
+    steps: int,
+    gap_before: float | None,
+) -> _Outcome:
+    """Break ties; where that costs more than the tolerance the strict minimisers stay."""
+    tidy = policy.canonical(lp, done.pair, done.value, done.screen)
+    if (tidy != done.pair).any() and _usable(lp, tidy, done.value):
+        tidy_value = policy.evaluate(lp, tidy, start=done.value, transient=lp.gamma >= 1)
         limit = (1 + tolerance / 4) * certificate.weighted(lp, done.value)
-        # Where breaking ties costs more than the tolerance, the strict minimisers stay.
         if tidy_value is not None and certificate.weighted(lp, tidy_value) <= limit:
-            return _Outcome(tidy, tidy_value, done.steps, gap_before)
-    return _Outcome(done.pair, done.value, done.steps, gap_before)
+            return _Outcome(tidy, tidy_value, steps, gap_before)
+    return _Outcome(done.pair, done.value, steps, gap_before)
 
 
-def _usable(lp: StabilizationLP, pair: Pairs) -> bool:
-    return lp.gamma < 1 or policy.stability_vector(lp, pair)[0] is not None
+def _usable(lp: StabilizationLP, pair: Pairs, guess: NDArray[np.float64] | None) -> bool:
+    return lp.gamma < 1 or policy.stability_vector(lp, pair, guess)[0] is not None
 
 
 class _Job:

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import bounds, linear, policy
-from lmdsl.bellman import padded
 from lmdsl.certificate import Verified, Witness, check, check_lower, check_upper, gap, weighted
 from lmdsl.lp import StabilizationLP
 
@@ -42,8 +41,8 @@ def certify(
     value, w
         Guesses of the policy's value and its unit-cost value; made where missing.
     """
-    w, d = policy.stability_vector(lp, pair, w)
-    V = policy.evaluate(lp, pair, start=value)
+    w, d = policy.stability_vector(lp, pair, w, sharp=True)
+    V = policy.evaluate(lp, pair, start=value, transient=w is not None)
     if V is None:
         witness = Witness(pair, w, None, lower_vector(lp, None, tolerance), None)
         return Verified(check(lp, witness, tolerance), witness)
@@ -125,11 +124,7 @@ def lower_vector(lp: StabilizationLP, V: Floats | None, tolerance: float) -> Flo
 
 def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
     """W = (1 - eps) V: it serves once r_a <= eps/(1 - eps) G_a for every surviving pair."""
-    rows = lp.rows
-    worst, stuck = bounds.worst_excess(
-        lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
-        lp.gamma, lp.cost, padded(V),
-    )  # fmt: skip
+    worst, stuck = bounds.worst_excess(lp, V)
     if stuck or not worst < 1:
         return None
     for margin in (1.0, 2.0, 16.0):
@@ -142,4 +137,4 @@ def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
 
 def _measure_vector(lp: StabilizationLP, pair: Pairs) -> Floats | None:
     inflow: Any = lp.gamma * lp.rows.matrix(pair).T.tocsr()
-    return linear.solve(inflow, lp.weight)
+    return linear.solve(inflow, lp.weight, enough=1e-13)

@@ -28,7 +28,8 @@ systems.*
 systems
 declarations
 problem
-sampling memory
+sampling memory threads
+linear
 partition rows
 boxes
 regions
@@ -37,7 +38,8 @@ local_check
 transitions
 graph
 lp
-bellman linear
+bellman
+screening
 bounds
 policy growth
 gamma

@@ -89,6 +89,8 @@ class Options:
         One of ``Capabilities.algorithms``, None for the first.
     start
         A g-stabilizing policy, shape (n,), a column per cell.
+    proof
+        w > 0 with w > g P_u w for that policy, g = max(gamma, 1), shape (n,); None where unknown.
     progress
         Called with (stage, fraction done or -1).
     """
@@ -98,6 +100,7 @@ class Options:
     max_iterations: int | None = None
     algorithm: str | None = None
     start: NDArray[np.int64] | None = None
+    proof: NDArray[np.float64] | None = None
     progress: Callable[[str, float], None] | None = None
 
 

@@ -22,7 +22,7 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
         limit = options.time_limit
         return limit is not None and time.monotonic() - started > limit
 
-    pair = options.start
+    pair, w = options.start, options.proof
     if pair is None:
         found = policy.stabilizing(lp, late)
         if isinstance(found, policy.Refused):
@@ -30,15 +30,19 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
         if isinstance(found, policy.Undecided):
             stop = Stop.TIME_LIMIT if late() else Stop.FAILED
             return Solution(stop, stop.name.lower())
-        pair = found.pair
-    value = policy.evaluate(lp, pair)
+        pair, w = found.pair, found.w
+    value = policy.bound(lp, pair, w)
+    if value is None:
+        value = policy.evaluate(lp, pair)
     if value is None:
         return Solution(Stop.FAILED, "the first policy has no finite value")
     done = policy.iterate(lp, pair, value, stop=late, limit=options.max_iterations)
     stop = Stop.OPTIMAL
     if not done.converged:
         stop = Stop.TIME_LIMIT if late() else Stop.ITERATION_LIMIT
-    return Solution(stop, stop.name.lower(), done.value, None, done.pair, done.steps)
+    return Solution(
+        stop, stop.name.lower(), done.value, None, done.pair, done.steps, {"iteration": done}
+    )
 
 
 BACKEND = Backend(

@@ -1,0 +1,212 @@
+"""Improvement passes that leave out what earlier passes prove worse.
+
+Along a falling sequence of values V the Q of a pair falls too, but no faster than V does: if
+V' >= r V then gamma P_a V' + G_a >= r (gamma P_a V + G_a) for 0 < r <= 1, because G_a >= 0. So
+Q / scale, stored once, with the product of all ratios so far, bounds Q from below for ever; a pair
+whose bound exceeds what the cell has already needs no look at its row. Bounds are single precision,
+a millionth below what was computed: far more than all rounding. Late passes read one number a
+cell, no rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from lmdsl import bellman
+from lmdsl.lp import StabilizationLP
+
+Floats = NDArray[np.float64]
+Pairs = NDArray[np.int64]
+
+LEAST_SCALE = 1e-30
+
+
+@dataclass(frozen=True)
+class Pass:
+    """The outcome of one pass.
+
+    Attributes
+    ----------
+    value
+        min(V, T V) where a control changed, min(V, T_u V) elsewhere, shape (n,).
+    pair
+        The policy after the pass, shape (n,).
+    changed
+        Number of cells whose control changed.
+    looked
+        Number of rows read.
+    """
+
+    value: Floats
+    pair: Pairs
+    changed: int
+    looked: int
+
+
+class Screen:
+    """Lower bounds of every Q, kept along a falling sequence of values.
+
+    Parameters
+    ----------
+    lp
+        The model.
+    gamma, cost
+        Other than the LP's own; ``cost`` has shape (K,).
+    """
+
+    def __init__(
+        self, lp: StabilizationLP, gamma: float | None = None, cost: Floats | None = None
+    ) -> None:
+        self.lp = lp
+        self.gamma = lp.gamma if gamma is None else gamma
+        self.cost = lp.cost if cost is None else cost
+        self.least = np.zeros(lp.K, dtype=np.float32)
+        self.rival = np.zeros(lp.n, dtype=np.float32)
+        self.scale = 1.0
+        self.passes = 0
+
+    def improve(self, V: Floats, pair: Pairs, margin: float) -> Pass:
+        """Change a control where another one is better by more than a relative margin.
+
+        Cells are visited forwards and backwards by turns, each with the new values of those before
+        it in the same range of cells, so that news travels far in a pass.
+
+        Parameters
+        ----------
+        V, pair
+            Values, shape (n,), and the policy, a column per cell.
+        margin
+            Q < Q_u - margin |Q_u| counts as better.
+        """
+        lp, rows = self.lp, self.lp.rows
+        value, new = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
+        x, backwards = bellman.padded(V), self.passes % 2 == 1
+        self.passes += 1
+
+        def part(cells: tuple[int, int]) -> tuple[int, int]:
+            changed, looked = _pass(
+                *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+                self.cost, self.gamma, x, pair, margin, self.scale,
+                backwards, self.least, self.rival, value, new,
+            )  # fmt: skip
+            return int(changed), int(looked)
+
+        counts = bellman.over_cells(lp, part)
+        return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
+
+    def tied(self, V: Floats, tolerance: float) -> NDArray[np.bool_]:
+        """Return the columns with Q <= Q_min + tolerance |Q_min| at V, shape (K,)."""
+        lp, rows = self.lp, self.lp.rows
+        x, ties = bellman.padded(V), np.zeros(lp.K, dtype=np.bool_)
+
+        def part(cells: tuple[int, int]) -> None:
+            _ties(
+                *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+                self.cost, self.gamma, x, tolerance, self.scale, self.least, ties,
+            )  # fmt: skip
+
+        bellman.over_cells(lp, part)
+        return ties
+
+    def follow(self, before: Floats, after: Floats) -> None:
+        """Note that V fell from ``before`` to ``after``."""
+        on = before > 0
+        ratio = float(np.divide(after, before, out=np.ones(len(before)), where=on).min(initial=1.0))
+        self.scale *= ratio * (1 - 1e-13)
+        if self.scale < LEAST_SCALE:
+            self.least *= np.float32(self.scale)
+            self.rival *= np.float32(self.scale)
+            self.scale = 1.0
+
+
+@njit(cache=True, nogil=True)
+def _expected(k, first, last, pointer, target, code, share, V, value):  # type: ignore[no-untyped-def]
+    """(P V)_k with the new values of the range of cells at hand."""
+    q = 0.0
+    for e in range(pointer[k], pointer[k + 1]):
+        j = target[e]
+        q += share[code[e]] * (value[j] if first <= j < last else V[j])
+    return q
+
+
+@njit(cache=True, nogil=True)
+def _pass(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, pair, margin, scale,
+    backwards, least, rival, value, new,
+):  # fmt: skip
+    """Improve the cells of a range in turn; ``least`` gets the bounds of the rows that were read.
+
+    V_i >= Q of the cell's own pair, so a pair whose bound exceeds V_i is no better; the own Q is
+    computed only where some rival remains. ``rival`` is the smallest bound of a cell's rivals.
+    """
+    changed, looked = 0, 0
+    store = (1.0 - 1e-6) / scale
+    for i in range(first, last):
+        value[i] = V[i]
+    for t in range(last - first):
+        i = last - 1 - t if backwards else first + t
+        own = pair[i]
+        new[i] = own
+        limit = V[i] / scale
+        if rival[i] >= limit:
+            continue
+        own_q, best, choice = np.inf, np.inf, own
+        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+            if k == own or least[k] >= limit:
+                continue
+            if own_q == np.inf:
+                own_q = _expected(own, first, last, pointer, target, code, share, V, value)
+                own_q = gamma * own_q + cost[own]
+                looked += 1
+                least[own] = min(own_q * store, 3e38)
+                best = own_q
+                limit = min(limit, own_q / scale)
+                if least[k] >= limit:
+                    continue
+            q = _expected(k, first, last, pointer, target, code, share, V, value)
+            q = gamma * q + cost[k]
+            looked += 1
+            least[k] = min(q * store, 3e38)
+            if q < best:
+                best, choice, limit = q, k, q / scale
+        if choice != own and best < own_q - margin * abs(own_q):
+            changed += 1
+            new[i] = choice
+        value[i] = min(value[i], best if new[i] != own else own_q)
+        smallest = np.float32(3e38)
+        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+            if k != new[i]:
+                smallest = min(smallest, least[k])
+        rival[i] = smallest
+    return changed, looked
+
+
+@njit(cache=True, nogil=True)
+def _ties(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, tolerance, scale,
+    least, ties,
+):  # fmt: skip
+    """Mark the tied columns of a range of cells: first Q_min, then all that come near."""
+    choices = 0
+    for i in range(first, last):
+        choices = max(choices, pair_pointer[i + 1] - pair_pointer[i])
+    q = np.empty(choices)
+    for i in range(first, last):
+        begin, end = pair_pointer[i], pair_pointer[i + 1]
+        best = np.inf
+        for k in range(begin, end):
+            if least[k] * scale > best * (1.0 + tolerance):
+                q[k - begin] = np.inf
+                continue
+            q_k = 0.0
+            for e in range(pointer[k], pointer[k + 1]):
+                q_k += share[code[e]] * V[target[e]]
+            q_k = gamma * q_k + cost[k]
+            q[k - begin] = q_k
+            best = min(best, q_k)
+        for k in range(begin, end):
+            ties[k] = q[k - begin] <= best + tolerance * abs(best)
