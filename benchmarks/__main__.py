@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from pathlib import Path
 
@@ -27,6 +28,7 @@ def main() -> int:
     rules = Rules(options.repeats, options.limit, options.budget)
     if options.smoke:
         rules = Rules(1, min(options.limit, 60.0), options.budget, at_once=True)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # end the contestants, too
     run = Run(options.out, rules, contestants, log=lambda text: print(text, flush=True))
     suites = SUITES if options.suite == "all" else (options.suite,)
     if options.smoke:

@@ -41,7 +41,7 @@ class Run:
     micro: dict[str, dict[str, Any]] = field(default_factory=dict)
     pipelines: dict[str, dict[str, Any]] = field(default_factory=dict)
     targets: list[dict[str, Any]] = field(default_factory=list)
-    exceeded: dict[tuple[str, str, bool], str] = field(default_factory=dict)
+    exceeded: dict[tuple[str, str, float], str] = field(default_factory=dict)
 
     def group(
         self, name: str, gamma: float, contestants: list[Contestant] | None = None
@@ -59,22 +59,23 @@ class Run:
     def _contest(
         self, model: models.Model, gamma: float, contestants: list[Contestant]
     ) -> dict[str, Any]:
+        def key(name: str) -> tuple[str, str, float]:
+            return name, model.family, gamma
+
         with tempfile.TemporaryDirectory(prefix="benchmarks-") as folder:
             try:
                 facts = prepared(model.name, gamma, Path(folder), 2 * self.rules.limit)
             except Failed as error:
                 self.log(f"{model.name}, gamma {gamma:g}: {error}")
                 return {"model": model.name, "gamma": gamma, "failed": str(error), "rows": []}
-            # Storm's gamma is 1 and QuantEcon's below; the LP solvers' may be anything.
-            hopeless = {one.name: (one.name, model.family, one.at == "own") for one in contestants}
-            fit = [one for one in contestants if hopeless[one.name] not in self.exceeded]
+            fit = [one for one in contestants if key(one.name) not in self.exceeded]
             rows = contest(facts, fit, Path(folder), self.rules, self.log)
         for row in rows:
             if row.status.startswith((">", "failed: killed")):
-                self.exceeded[hopeless[row.contestant]] = model.name
+                self.exceeded[key(row.contestant)] = model.name
         for one in contestants:
             if one not in fit:
-                smaller = self.exceeded[hopeless[one.name]]
+                smaller = self.exceeded[key(one.name)]
                 note = f"not tried: exceeded its limits on {smaller}"
                 rows.append(Row(one.name, f"> {self.rules.limit:g} s", note))
         return {**facts, "rows": [asdict(row) for row in rows]}
