@@ -23,6 +23,9 @@ from benchmarks.rivals import OURS, Contestant
 
 Log = Callable[[str], None]
 
+GRACE = 60.0
+"""Seconds to start a process, import its packages and solve the tiny model."""
+
 
 @dataclass(frozen=True)
 class Rules:
@@ -33,7 +36,8 @@ class Rules:
     repeats
         Timed solves of each contestant.
     limit
-        Seconds after which a contestant is stopped, for building and for each solve.
+        Seconds after which a contestant is stopped, for building (and GRACE more, to start) and
+        for each solve.
     budget
         Seconds of timed solves per contestant: a slow one solves less often.
     spare
@@ -68,7 +72,7 @@ class Session:
 
     def ready(self) -> dict[str, Any]:
         """Wait until it has built the model."""
-        return self._answer()
+        return self._answer(self.limit + GRACE, " to build")
 
     def solve(self) -> dict[str, Any]:
         """Have it solve once."""
@@ -76,16 +80,16 @@ class Session:
         with contextlib.suppress(BrokenPipeError):
             self.process.stdin.write(b"solve\n")
             self.process.stdin.flush()
-        return self._answer()
+        return self._answer(self.limit)
 
-    def _answer(self) -> dict[str, Any]:
+    def _answer(self, limit: float, what: str = "") -> dict[str, Any]:
         """Read one line; whatever else happens is a failure that says what."""
         assert self.process.stdout is not None
-        deadline, text = time.monotonic() + self.limit, b""
+        deadline, text = time.monotonic() + limit, b""
         while not text.endswith(b"\n"):
             left = deadline - time.monotonic()
             if left <= 0 or not select.select([self.process.stdout], [], [], left)[0]:
-                raise Failed(f"> {self.limit:g} s")
+                raise Failed(f"> {self.limit:g} s{what}")
             piece = os.read(self.process.stdout.fileno(), 65536)
             if not piece:
                 raise Failed(f"failed: {ended(self.process.wait())}{self._last_words()}")

