@@ -102,7 +102,7 @@ def _group(group: dict[str, Any]) -> Iterator[str]:
 
 
 def _row(row: dict[str, Any]) -> list[str]:
-    remark = row["note"] if row["status"] == "ok" else f"{row['status']}; {row['note']}".strip("; ")
+    remark = "; ".join(filter(None, [row["status"].partition(":")[2].strip(), row["note"]]))
     timed = row["median"] is not None
     return [
         row["contestant"],
