@@ -1,0 +1,44 @@
+"""Compile, solve and verify in a fresh process: time of each stage, peak memory and estimates."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import lmdsl as lm
+from benchmarks import internals, models
+from benchmarks.process import peak
+
+
+def run(name: str, gamma: float | None, repeats: int) -> dict[str, Any]:
+    """Run the pipeline on a model with the kernels loaded; all times in seconds."""
+    lm.solve(models.get(models.WARM).compiled(gamma))
+    base = peak()
+    times: dict[str, list[float]] = {"compile": [], "solve": [], "verify": [], "total": []}
+    result = None
+    for _ in range(repeats):
+        result = lp = None  # only one model at a time
+        started = time.perf_counter()
+        with internals.estimates() as seen:
+            lp = models.get(name).compiled(gamma)
+        compiled = time.perf_counter()
+        result = lm.solve(lp)
+        ended = time.perf_counter()
+        times["compile"].append(compiled - started)
+        times["solve"].append(result.seconds.solve or 0.0)
+        times["verify"].append(result.seconds.verify or 0.0)
+        times["total"].append(ended - started)
+    assert result is not None
+    return {
+        "model": name,
+        "gamma": result.gamma,
+        "status": result.status,
+        "gap": result.gap,
+        "cells": result.cells,
+        "pairs": result.pairs,
+        "transitions": len(internals.transitions(result.lp)[1]),
+        "seconds": times,
+        "base": base,
+        "peak": peak(),
+        "estimates": seen,
+    }
