@@ -26,9 +26,9 @@ systems.*
 systems
 declarations
 problem
-sampling memory
+sampling memory threads merging
 partition rows
-regions
+regions sampler
 transitions
 graph
 lp
