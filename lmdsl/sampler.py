@@ -19,8 +19,8 @@ from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.program import Program
 
-CHUNK = 2**15
-"""Samples evaluated at a time: the temporaries of a formula stay in cache."""
+CHUNK = 2**16
+"""Samples evaluated at a time: few enough to stay in cache, many enough to keep threads apart."""
 
 Floats = NDArray[np.float64]
 
