@@ -20,7 +20,8 @@ from lmdsl.lp import StabilizationLP
 from lmdsl.partition import Partition
 from lmdsl.phase_one import PhaseOne
 from lmdsl.problem import Problem
-from lmdsl.transitions import Progress, Sampler, Transitions, assemble
+from lmdsl.sampler import Sampler
+from lmdsl.transitions import Progress, Transitions, assemble
 
 LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
 MEANING = {

@@ -15,7 +15,8 @@ from lmdsl.graph import CellStatus
 from lmdsl.partition import Partition
 from lmdsl.result import jsonable
 from lmdsl.rows import Rows
-from lmdsl.transitions import Sampler, outcome
+from lmdsl.sampler import Block, Sampler
+from lmdsl.transitions import outcome
 
 NAMES = {status: status.name.lower().replace("_", " ") for status in CellStatus}
 """The causes as words: "escapes", "trapped", "leads to these", ..."""
@@ -173,17 +174,17 @@ def _move(sampler: Sampler, status: NDArray[np.uint8], cell: int, control: int) 
     if not leaving.any():
         bad = (code != CellStatus.STABILIZED) & (code != CellStatus.ATTRACTOR)
     s = int(np.argmax(bad))
-    shape = (1, 1, len(sampler.points), len(nodes.weights))
-    values = sampler.values(np.array([cell]), slice(control, control + 1))
+    shape = (1, len(sampler.points), len(nodes.weights), 1)
+    values = sampler.values(Block(0, np.array([cell]), (control, control + 1)))
     point, node = divmod(s, len(nodes.weights))
     image = [
-        float(np.broadcast_to(x.reshape((1,) * (4 - x.ndim) + x.shape), shape)[0, 0, point, node])
+        float(np.broadcast_to(x.reshape((1,) * (4 - x.ndim) + x.shape), shape)[0, point, node, 0])
         for x in sampler.step(values)
     ]
     problem = sampler.problem
     found: dict[str, Any] = {
         "control": dict(zip(problem.controls, map(float, sampler.controls[control]), strict=True)),
-        "state": {name: float(values[name][0, 0, point, 0]) for name in problem.states},
+        "state": {name: float(values[name][0, point, 0, 0]) for name in problem.states},
         "noise": {name: float(nodes.values[node, k]) for k, name in enumerate(problem.noises)},
         "image": dict(zip(problem.states, image, strict=True)),
         "share": float(weight[bad].sum()),

@@ -10,19 +10,24 @@ that some control can send to level L. As printed it never stops with success (i
 levels, A among them, with the cells without A); here it stops when a level is empty, and succeeds
 when every cell has one.
 
-All passes run over the predecessors of each cell, so a pass costs one visit per entry.
+Levels are found by sweeps over the rows as they are stored, one for each level: a cell is on level
+L + 1 if it is on none so far and a pair of it has a target on level L. Where there are many levels
+that is too slow; then, and to remove cells, passes run over the predecessors of each cell, at one
+visit per entry in all.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numba import njit
+from numba import njit, types
 from numpy.typing import NDArray
 
+from lmdsl import threads
 from lmdsl.rows import Rows
 from lmdsl.transitions import Transitions
 
@@ -77,30 +82,34 @@ class Stabilizable:
         Which pairs survive: cell in C, every successor in C u A, shape (pairs,).
     reaches
         Free cells from which A can be reached through admissible pairs, shape (F,).
+    level, pair
+        Algorithm 1 on the surviving pairs, see :func:`tree`; each of shape (F,).
     """
 
     inside: NDArray[np.bool_]
     surviving: NDArray[np.bool_]
     reaches: NDArray[np.bool_]
+    level: NDArray[np.int32]
+    pair: NDArray[np.int64]
 
 
 def stabilizable(pair_pointer: NDArray[np.int64], rows: Rows) -> Stabilizable:
     """Return the greatest set from which A is reached almost surely, and the pairs it keeps."""
-    before = Predecessors.of(rows)
-    cells = rows.columns
-    cell = owner(pair_pointer)
+    before: Predecessors | None = None
     alive = np.ones(rows.count, dtype=np.bool_)
-    inside = np.ones(cells, dtype=np.bool_)
+    inside = np.ones(rows.columns, dtype=np.bool_)
     choices = np.diff(pair_pointer)
     reaches = None
     while True:
-        level, _ = _levels(before.pointer, before.pair, cell, alive, cells)
+        level, pair = _tree(pair_pointer, rows, alive, before)
         reached = level >= 0
         if reaches is None:
             reaches = reached
         lost = np.flatnonzero(inside & ~reached)
         if not len(lost):
-            return Stabilizable(inside, alive, reaches)
+            return Stabilizable(inside, alive, reaches, level, pair)
+        before = before or Predecessors.of(rows)
+        cell = owner(pair_pointer)
         _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)
 
 
@@ -136,29 +145,68 @@ def tree(
         there is none. On the surviving pairs this policy is stabilizing: each cell has a positive
         chance to descend, and none can leave.
     """
-    before = Predecessors.of(rows)
     if allowed is None:
         allowed = np.ones(rows.count, dtype=np.bool_)
-    level, pair = _levels(before.pointer, before.pair, owner(pair_pointer), allowed, rows.columns)
-    return level, pair
+    return _tree(pair_pointer, rows, allowed)
+
+
+PATIENCE = 8
+"""Visits per entry that sweeps may cost before predecessors are made: these cost about as much."""
+
+SMALL = 2**20
+"""Entries of rows below which one thread is fastest."""
+
+
+def _tree(
+    pair_pointer: NDArray[np.int64],
+    rows: Rows,
+    alive: NDArray[np.bool_],
+    before: Predecessors | None = None,
+) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Return levels and pairs as :func:`tree`; with predecessors at hand, by these alone."""
+    cells = rows.columns
+    level = np.full(cells + 1, -1, dtype=np.int32)
+    level[cells] = 0
+    pair = np.full(cells, -1, dtype=np.int64)
+    front = level == 0
+    parts = 1 if len(rows.target) < SMALL else 8 * threads.count()
+    bounds = np.linspace(0, cells, parts + 1).astype(np.int64).tolist()
+    spans = list(itertools.pairwise(bounds))
+    left = 0 if before else PATIENCE * len(rows.target)
+    below = 0
+
+    def sweep(span: tuple[int, int]) -> int:
+        return int(
+            _sweep(pair_pointer, rows.pointer, rows.target, alive, front, below, level, pair, *span)
+        )
+
+    while left > 0 and front.any():
+        left -= sum(map(sweep, spans) if parts == 1 else threads.in_order(sweep, spans))
+        below += 1
+        np.equal(level, below, out=front)
+    if front.any():
+        before = before or Predecessors.of(rows)
+        start = np.flatnonzero(front)
+        _search(before.pointer, before.pair, owner(pair_pointer), alive, start, level, pair)
+    return level[:-1], pair
 
 
 def restrict(
     transitions: Transitions, found: Stabilizable
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Rows]:
+) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64], Rows]:
     """Keep the surviving pairs and number the cells of C.
 
     Returns
     -------
-    kept : pair indices that survive, ascending
+    kept : pair indices that survive, ascending, or the slice of all
     pair_pointer : pairs by cell of C
     rows : their rows, targets numbering the cells of C, |C| for the attractor
     """
     rows = transitions.rows
-    kept = np.flatnonzero(found.surviving)
     n = int(found.inside.sum())
-    if n == rows.columns and len(kept) == rows.count:
-        return kept, transitions.pair_pointer, rows
+    if n == rows.columns and found.surviving.all():
+        return slice(None), transitions.pair_pointer, rows
+    kept = np.flatnonzero(found.surviving)
     per_cell = np.add.reduceat(
         np.append(found.surviving, False), transitions.pair_pointer[:-1], dtype=np.int64
     )
@@ -193,41 +241,60 @@ def _transpose(pointer, target, out_pointer, pair):  # type: ignore[no-untyped-d
             position[j] += 1
 
 
+_POINTER = types.Array(types.int64, 1, "C", readonly=True)
+_TARGET = types.Array(types.int32, 1, "C", readonly=True)
+_MASK = types.Array(types.boolean, 1, "C", readonly=True)
+
+
+@njit(
+    types.int64(
+        _POINTER, _POINTER, _TARGET, _MASK, _MASK,
+        types.int64, types.int32[::1], types.int64[::1], types.int64, types.int64,
+    ),
+    cache=True,
+    nogil=True,
+)  # fmt: skip
+def _sweep(pair_pointer, pointer, target, alive, front, below, level, pair, first, last):  # type: ignore[no-untyped-def]
+    """Put on level ``below + 1`` the cells first..last-1 without level that can enter the front.
+
+    Returns the number of entries visited. ``front`` is the cells on level ``below``.
+    """
+    visits = 0
+    for i in range(first, last):
+        if level[i] >= 0:
+            continue
+        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+            if not alive[k]:
+                continue
+            enters = False
+            for e in range(pointer[k], pointer[k + 1]):
+                enters |= front[target[e]]
+            visits += pointer[k + 1] - pointer[k]
+            if enters:
+                level[i], pair[i] = below + 1, k
+                break
+    return visits
+
+
 @njit(cache=True, nogil=True)
-def _levels(pointer, pair, cell, alive, cells):  # type: ignore[no-untyped-def]
-    """Breadth-first levels from the attractor (number ``cells``) against alive pairs."""
-    level = np.full(cells, -1, dtype=np.int32)
-    choice = np.full(cells, -1, dtype=np.int64)
-    queue = np.empty(cells, dtype=np.int64)
-    end = 0
-    for e in range(pointer[cells], pointer[cells + 1]):
-        k = pair[e]
-        if alive[k]:
-            i = cell[k]
-            if level[i] < 0:
-                level[i] = 1
-                choice[i] = k
-                queue[end] = i
-                end += 1
-            elif k < choice[i]:
-                choice[i] = k
-    start = 0
-    while start < end:
-        j = queue[start]
-        start += 1
-        below = level[j]
+def _search(pointer, before, cell, alive, start, level, pair):  # type: ignore[no-untyped-def]
+    """Breadth-first search from the cells of the highest level so far, over predecessors."""
+    queue = np.empty(len(level), dtype=np.int64)
+    at, end = 0, len(start)
+    queue[:end] = start
+    while at < end:
+        j = queue[at]
+        at += 1
         for e in range(pointer[j], pointer[j + 1]):
-            k = pair[e]
+            k = before[e]
             if alive[k]:
                 i = cell[k]
                 if level[i] < 0:
-                    level[i] = below + 1
-                    choice[i] = k
+                    level[i], pair[i] = level[j] + 1, k
                     queue[end] = i
                     end += 1
-                elif level[i] == below + 1 and k < choice[i]:
-                    choice[i] = k
-    return level, choice
+                elif level[i] == level[j] + 1 and k < pair[i]:
+                    pair[i] = k
 
 
 @njit(cache=True, nogil=True)

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from lmdsl.graph import CellStatus
 from lmdsl.partition import EDGE
 from lmdsl.result import jsonable
+from lmdsl.sampler import CHUNK, Sampler
 from lmdsl.sampling import control_values
-from lmdsl.transitions import CHUNK, Sampler
 
 STEPS, NEAR, SUPPORT, QUANTILE = 64, 0.25, 0.05, 0.9
 MOST_CELLS, MOST_CONTROLS, MOST_POINTS, MOST_NODES = 512, 64, 16, 4

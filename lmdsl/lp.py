@@ -261,17 +261,21 @@ def compile(problem: Problem, progress: Progress | None = None) -> Stabilization
     status[regions.free] = graph.causes(found, transitions.pair_pointer)
     status[regions.attractor] = CellStatus.ATTRACTOR
     cells = regions.free[found.inside]
-    everything = len(kept) == len(transitions.control)
-    return StabilizationLP(
+    lp = StabilizationLP(
         problem=problem,
         partition=partition,
         controls=control_vectors(problem),
         cell_status=status,
         cells=cells,
         pair_pointer=pair_pointer,
-        control=transitions.control if everything else transitions.control[kept],
+        control=transitions.control[kept],
         rows=rows,
-        cost=transitions.cost if everything else transitions.cost[kept],
+        cost=transitions.cost[kept],
         gamma=problem.gamma,
         weight=regions.weight(cells),
     )
+    # The search that found C ends with Algorithm 1 on the surviving pairs.
+    pair = found.pair[found.inside]
+    column = pair if isinstance(kept, slice) else np.searchsorted(kept, pair)
+    vars(lp)["tree"] = found.level[found.inside], column
+    return lp

@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, types
@@ -109,28 +111,38 @@ class Partition:
         clip
             Saturate finite images into the box; default: as the problem's ``on_exit`` says.
         """
-        shape = np.broadcast_shapes(*(np.shape(image) for image in images))
-        padded = (1,) * (4 - len(shape)) + shape if len(shape) <= 4 else (1, 1, 1, math.prod(shape))
-        flat = np.zeros(padded, dtype=np.int64)
-        self.locate_into(flat, [np.broadcast_to(i, shape).reshape(padded) for i in images], clip)
-        return flat.reshape(shape)
+        index = self.index(images, clip)
+        return np.where(index >= 0, index, -1.0).astype(np.int64)
 
-    def locate_into(
-        self, flat: Indices, images: Sequence[Floats], clip: bool | None = None
-    ) -> None:
-        """Fill ``flat`` (4-D, zeros on entry) with the cells of 4-D broadcastable images."""
+    def index(self, images: Sequence[Floats], clip: bool | None = None) -> Floats:
+        """Return the cell of every image as a double, NaN outside the box or where not finite.
+
+        An image is located in its own shape, before it is broadcast: what does not depend on the
+        control is located once for all controls. Parameters as for :meth:`locate`.
+        """
         saturate = self.clip if clip is None else clip
-        for k, image in enumerate(images):
-            _locate(
-                flat,
-                np.broadcast_to(np.asarray(image, dtype=np.float64), flat.shape),
+        total: Floats | None = None
+        for axis, image in zip(self._axes, images, strict=True):
+            x = np.asarray(image, dtype=np.float64)
+            if total is None or x.shape == total.shape:
+                total = axis.add_index(x, saturate, total)
+            else:  # NaN on one axis makes the sum NaN
+                total = total + axis.add_index(x, saturate, None)
+        return np.zeros(()) if total is None else total
+
+    @cached_property
+    def _axes(self) -> tuple[_Axis, ...]:
+        return tuple(
+            _Axis(
                 float(self.low[k]),
                 float(self.high[k]),
                 float(self.width[k]),
-                int(self.cells[k]),
+                float(self.cells[k]),
+                float(math.prod(self.shape[k + 1 :])),
                 bool(self.periodic[k]),
-                saturate and not bool(self.periodic[k]),
             )
+            for k in range(self.dimension)
+        )
 
     def multi_index(self, cell: NDArray[np.integer]) -> tuple[Indices, ...]:
         """Return the index of each cell on every axis."""
@@ -228,50 +240,81 @@ def _units(x: float, low: float, width: float) -> float:
         return float((x - low) / width)
 
 
-_IMAGE = types.Array(types.float64, 4, "A", readonly=True)
+_IMAGE = types.Array(types.float64, 1, "C", readonly=True)
+_F, _OUT = types.float64, types.float64[::1]
+
+
+class _Axis(NamedTuple):
+    """One axis in plain numbers; ``stride`` cells of the box lie between neighbours on it."""
+
+    low: float
+    high: float
+    width: float
+    cells: float
+    stride: float
+    periodic: bool
+
+    def add_index(self, image: Floats, clip: bool, total: Floats | None) -> Floats:
+        """Add the index on this axis, times the stride, to the indices on others; NaN outside.
+
+        Without a total it is a new array in the shape of the image.
+        """
+        found = np.zeros(image.shape) if total is None else total
+        flat, line = np.ascontiguousarray(image).reshape(-1), found.reshape(-1)
+        if self.periodic:
+            _circle(flat, self.low, self.width, self.cells, self.stride, line)
+        else:
+            _interval(flat, self.low, self.high, self.width, self.cells, self.stride, clip, line)
+        return found
+
+
+# The two kernels have no branch in the loop, so that they run on vectors of doubles.
+@njit(
+    types.void(_IMAGE, _F, _F, _F, _F, _OUT), cache=True, nogil=True, error_model="numpy"
+)  # division by zero cannot occur, and its test would be a branch
+def _circle(image, low, width, cells, stride, index):  # type: ignore[no-untyped-def]
+    """Add stride (k mod cells), k = floor((x - low)/width + EDGE); NaN where k is not finite.
+
+    For |k| < 2^51 the quotient floor(k/cells) is off by at most one, its multiple of cells and the
+    rest are exact, and one addition brings the rest into 0..cells-1.
+    """
+    inverse = 1.0 / cells
+    far = False
+    for i in range(len(image)):
+        k = np.floor((image[i] - low) / width + EDGE)
+        rest = k - cells * np.floor(k * inverse)
+        rest = rest + cells if rest < 0.0 else rest
+        rest = rest - cells if rest >= cells else rest
+        near = abs(k) < 2.0**51
+        far |= not near
+        index[i] += stride * rest if near else 0.0
+    if far:
+        for i in range(len(image)):
+            k = np.floor((image[i] - low) / width + EDGE)
+            if not abs(k) < 2.0**51:
+                index[i] += stride * (k % cells) if np.isfinite(k) else np.nan
 
 
 @njit(
-    types.void(
-        types.int64[:, :, :, ::1],
-        _IMAGE,
-        types.float64,
-        types.float64,
-        types.float64,
-        types.int64,
-        types.boolean,
-        types.boolean,
-    ),
+    types.void(_IMAGE, _F, _F, _F, _F, _F, types.boolean, _OUT),
     cache=True,
     nogil=True,
+    error_model="numpy",
 )
-def _locate(flat, image, low, high, width, cells, periodic, clip):  # type: ignore[no-untyped-def]
-    """Advance C-order cell indices by one axis; -1 sticks once an image has left."""
-    n = float(cells)
-    for c in range(flat.shape[0]):
-        for a in range(flat.shape[1]):
-            for p in range(flat.shape[2]):
-                for q in range(flat.shape[3]):
-                    f = flat[c, a, p, q]
-                    if f < 0:
-                        continue
-                    x = image[c, a, p, q]
-                    if not np.isfinite(x):
-                        flat[c, a, p, q] = -1
-                        continue
-                    if clip:
-                        x = min(max(x, low), high)
-                    t = (x - low) / width
-                    k = np.floor(t + EDGE)
-                    if periodic:
-                        if k < 0.0 or k >= n:
-                            if not np.isfinite(k):
-                                flat[c, a, p, q] = -1
-                                continue
-                            k = k % n
-                    elif k >= n and (t - n <= EDGE or (clip and x == high)):
-                        k = n - 1.0
-                    elif not (0.0 <= k < n):
-                        flat[c, a, p, q] = -1
-                        continue
-                    flat[c, a, p, q] = f * cells + np.int64(k)
+def _interval(image, low, high, width, cells, stride, clip, index):  # type: ignore[no-untyped-def]
+    """Add stride k, k = floor((x - low)/width + EDGE), for 0 <= k < cells; NaN elsewhere.
+
+    An image up to EDGE above the last cell belongs to it. With ``clip`` a finite image is moved
+    into the interval first.
+    """
+    for i in range(len(image)):
+        x = image[i]
+        finite = abs(x) < np.inf
+        if clip:
+            x = low if x < low else x
+            x = high if x > high else x
+        t = (x - low) / width
+        k = np.floor(t + EDGE)
+        last = (k >= cells) & ((t - cells <= EDGE) | (clip & (x == high)))
+        k = cells - 1.0 if last else k
+        index[i] += stride * k if finite & (k >= 0.0) & (k < cells) else np.nan

@@ -41,7 +41,8 @@ class Regions:
         mass = self.mass[cells]
         if mass.max(initial=0.0) > 1e290:
             mass = mass / mass.max()  # the sum would overflow
-        total = math.fsum(mass)
+        equal = len(mass) > 0 and bool((mass == mass[0]).all())
+        total = len(mass) * float(mass[0]) if equal else math.fsum(mass)  # both correctly rounded
         return mass / total if total > 0 else np.zeros(len(cells))
 
     @classmethod

@@ -5,32 +5,28 @@ image lies in D_j (the paper's m(T_a^{-1}(D_j) n D_i)/m(D_i), estimated). Nothin
 share in cells + absorbed + escaped = 1 for every pair. A pair with an escaping sample is
 inadmissible and its row is not kept.
 
-Formulas are evaluated on arrays of shape (cells, controls, points, nodes) that broadcast: what
-does not depend on the control is computed once per cell. Work goes in chunks of cells, so memory
-beyond the result is bounded.
+Work goes in blocks of pairs: memory beyond the result is bounded. Blocks are computed in several
+threads and appended in order, so the rows do not depend on the number of threads.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, types
 from numpy.typing import NDArray
 
-from lmdsl import memory, sampling
+from lmdsl import memory, sampling, threads
 from lmdsl.errors import BadInput
+from lmdsl.merging import LANES, merge
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.program import Program
 from lmdsl.regions import Regions
 from lmdsl.rows import Rows, Shares, code_type
-
-CHUNK = 2**16
-"""Samples evaluated at a time: the temporaries of a formula stay in cache."""
+from lmdsl.sampler import CHUNK, Block, Sampler
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
@@ -59,73 +55,6 @@ class Transitions:
     control: NDArray[np.int32]
     rows: Rows
     cost: Floats
-
-
-class Sampler:
-    """Evaluates a problem's map and stage cost at the samples of chunks of cells.
-
-    Attributes
-    ----------
-    controls
-        Control vectors, shape (M, p).
-    points, nodes
-        Sample offsets (points, d) and noise nodes.
-    """
-
-    def __init__(self, problem: Problem, partition: Partition) -> None:
-        self.problem, self.partition = problem, partition
-        self.points = sampling.offsets(problem)
-        self.controls = sampling.control_vectors(problem)
-        self.nodes = sampling.noise_nodes(problem)
-        self.samples = len(self.points) * len(self.nodes.weights)
-        self.step = problem.step()
-        self.cost = Program([problem.cost()], problem.system.constants())
-
-    def values(self, cells: NDArray[np.int64], controls: slice) -> dict[str, Floats]:
-        """Return named arrays that broadcast to (cells, controls, points, nodes)."""
-        axes = self.partition.samples(cells, self.points)
-        named = {
-            name: axis[:, None, :, None]
-            for name, axis in zip(self.problem.states, axes, strict=True)
-        }
-        for k, name in enumerate(self.problem.controls):
-            named[name] = np.ascontiguousarray(self.controls[controls, k])[None, :, None, None]
-        for k, name in enumerate(self.problem.noises):
-            named[name] = np.ascontiguousarray(self.nodes.values[:, k])[None, None, None, :]
-        return named
-
-    def evaluate(
-        self, cells: NDArray[np.int64], controls: slice
-    ) -> tuple[NDArray[np.int64], Floats, NDArray[np.bool_]]:
-        """Return the image cells (cells, controls, points, nodes), mean cost and its validity."""
-        width = len(range(*controls.indices(len(self.controls))))
-        shape = (len(cells), width, len(self.points), len(self.nodes.weights))
-        values = self.values(cells, controls)
-        flat = np.zeros(shape, dtype=np.int64)
-        images = [_four(image) for image in self.step(values)]
-        self.partition.locate_into(flat, images)
-        cost = np.broadcast_to(_four(self.cost(values)[0]), shape)
-        mean, valid = np.empty(shape[:2]), np.empty(shape[:2], dtype=np.bool_)
-        _mean_cost(cost, self.nodes.weights, mean, valid)
-        return flat, mean, valid
-
-    def blocks(self, cells: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], slice]]:
-        """Yield (cells, controls) so that each block has about CHUNK samples, in pair order."""
-        M = len(self.controls)
-        per_cell = M * self.samples
-        if per_cell <= CHUNK:
-            step = CHUNK // per_cell
-            for i in range(0, len(cells), step):
-                yield cells[i : i + step], slice(0, M)
-            return
-        step = max(1, CHUNK // self.samples)
-        for i in range(len(cells)):
-            for a in range(0, M, step):
-                yield cells[i : i + 1], slice(a, min(a + step, M))
-
-
-def _four(array: Floats) -> Floats:
-    return array.reshape((1,) * (4 - array.ndim) + array.shape)
 
 
 def estimate(problem: Problem, entries: float = 1.0) -> int:
@@ -158,63 +87,105 @@ def assemble(
     memory.require(estimate(problem), "a lower estimate, before sampling")
     regions = Regions.of(problem, partition)
     sampler = Sampler(problem, partition)
-    memory.require(estimate(problem, _pilot(sampler, regions)), "estimated from a few cells")
-    F, M, S = len(regions.free), len(sampler.controls), sampler.samples
-    group = np.tile(sampler.nodes.group, len(sampler.points))
-    first_code = _first_codes(sampler)
+    mean_entries = _pilot(sampler, regions)
+    memory.require(estimate(problem, mean_entries), "estimated from a few cells")
+    F, M = len(regions.free), len(sampler.controls)
     shares = Shares.of(len(sampler.points), sampler.nodes)
-    length = _Growing(np.int32)  # entries of each pair's row, 0 where inadmissible
-    cost, target = _Growing(np.float64), _Growing(np.int32)
-    code = _Growing(code_type(len(shares.numerator)))
+    room = int(F * M * mean_entries * 1.05) + sampler.samples
+    pointer, control = _Growing(np.int64, F * M + 1), _Growing(np.int32, F * M)
+    cost = _Growing(np.float64, F * M)
+    target, code = _Growing(np.int32, room), _Growing(code_type(len(shares.numerator)), room)
+    pair_pointer = np.zeros(F + 1, dtype=np.int64)
+    pointer.append(np.zeros(1, dtype=np.int64))
     done = 0
-    for cells, controls in sampler.blocks(regions.free):
-        flat, mean, valid = sampler.evaluate(cells, controls)
-        pairs = flat.shape[0] * flat.shape[1]
-        lengths = length.room(pairs)
-        used = _merge(
-            flat.reshape(pairs, S),
-            regions.number,
-            group,
-            first_code,
-            lengths,
-            target.room(pairs * S),
-            code.room(pairs * S),
-        )
-        kept = lengths > 0
-        if not valid.ravel()[kept].all():
-            _refuse_cost(sampler, cells, controls, kept & ~valid.ravel())
-        cost.room(int(kept.sum()))[:] = mean.ravel()[kept]
-        for growing, count in ((length, pairs), (target, used), (code, used)):
-            growing.keep(count)
-        cost.keep(int(kept.sum()))
-        done += pairs
+    # glibc returns the memory of a block to the system, to fault it in again for the next one,
+    # unless it has seen more than that freed at once.
+    np.empty(2**20)
+    for block, rows in threads.in_order(_Assembler(sampler, regions), sampler.blocks(regions.free)):
+        pair_pointer[1 + block.first : 1 + block.first + len(block.cells)] += rows.per_cell
+        pointer.append(rows.end + target.used)
+        control.append(rows.control)
+        cost.append(rows.cost)
+        target.append(rows.target)
+        code.append(rows.code)
+        done += block.lanes
         if progress:
             progress("transitions", done / (F * M))
-    lengths = length.array()
-    admissible = lengths > 0
-    pointer = np.zeros(int(admissible.sum()) + 1, dtype=np.int64)
-    np.cumsum(lengths[admissible], out=pointer[1:])
-    per_cell = admissible.reshape(F, M).sum(axis=1)
-    control = np.tile(np.arange(M, dtype=np.int32), F)[admissible]
     return Transitions(
         regions=regions,
-        pair_pointer=np.concatenate([[0], np.cumsum(per_cell)]).astype(np.int64),
-        control=control,
-        rows=Rows(pointer, target.array(), code.array(), shares, F),
+        pair_pointer=np.cumsum(pair_pointer, out=pair_pointer),
+        control=control.array(),
+        rows=Rows(pointer.array(), target.array(), code.array(), shares, F),
         cost=cost.array(),
     )
 
 
 def outcome(sampler: Sampler, cell: int, control: int) -> NDArray[np.int64]:
     """Return the image cell of every sample of one pair, -1 where it leaves, shape (S,)."""
-    flat, _, _ = sampler.evaluate(np.array([cell]), slice(control, control + 1))
-    return flat.reshape(-1)
+    block = Block(0, np.array([cell]), (control, control + 1))
+    index = sampler.images(block, sampler.values(block)).reshape(-1)
+    return np.where(index >= 0, index, -1.0).astype(np.int64)
 
 
-def _first_codes(sampler: Sampler) -> NDArray[np.int64]:
-    """Code of a single sample of each group (see rows.Shares)."""
-    sizes = np.bincount(sampler.nodes.group) * len(sampler.points)
-    return np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+class _BlockRows(NamedTuple):
+    """The admissible pairs of a block, ordered by cell, then control.
+
+    Attributes
+    ----------
+    per_cell
+        Number of pairs of each cell.
+    control, cost, end
+        Per pair: control index, mean cost, end of its row.
+    target, code
+        The rows one after the other.
+    """
+
+    per_cell: NDArray[np.int64]
+    control: NDArray[np.int32]
+    cost: Floats
+    end: NDArray[np.int64]
+    target: NDArray[np.int32]
+    code: NDArray[np.uint32]
+
+
+class _Assembler:
+    """Computes the rows of blocks; it may be called from several threads at once."""
+
+    def __init__(self, sampler: Sampler, regions: Regions) -> None:
+        self.sampler, self.number = sampler, regions.number
+        nodes = sampler.nodes
+        sizes = np.bincount(nodes.group) * len(sampler.points)
+        self.first_code = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+        self.bits = int(nodes.group.max()).bit_length()
+        wide = (len(regions.free) + 1) << self.bits > 2**31
+        self.key = np.int64 if wide else np.int32
+        self.group = np.tile(nodes.group, len(sampler.points)).astype(self.key)
+
+    def __call__(self, block: Block) -> tuple[Block, _BlockRows]:
+        sampler, lanes = self.sampler, block.lanes
+        values = sampler.values(block)
+        index = sampler.images(block, values)
+        mean = sampler.costs(block, values)
+        per_cell = np.zeros(len(block.cells), dtype=np.int64)
+        control, cost = np.empty(lanes, dtype=np.int32), np.empty(lanes)
+        end = np.empty(lanes, dtype=np.int64)
+        target = np.empty(index.size, dtype=np.int32)
+        code = np.empty(index.size, dtype=np.uint32)
+        key = np.empty((sampler.samples, LANES), dtype=self.key)
+        pairs, entries = merge(
+            index, block.cells_last, mean, self.number, self.group, self.bits, self.first_code,
+            key, per_cell, control, cost, end, target, code,
+        )  # fmt: skip
+        control, cost = control[:pairs], cost[:pairs]
+        if block.controls[0]:
+            control += block.controls[0]
+        if np.isnan(cost).any():
+            k = int(np.isnan(cost).argmax())
+            cell = block.cells[np.searchsorted(np.cumsum(per_cell), k, side="right")]
+            _refuse_cost(sampler, int(cell), int(control[k]))
+        return block, _BlockRows(
+            per_cell, control, cost, end[:pairs], target[:entries], code[:entries]
+        )
 
 
 def _pilot(sampler: Sampler, regions: Regions) -> float:
@@ -224,20 +195,15 @@ def _pilot(sampler: Sampler, regions: Regions) -> float:
     M, S = len(sampler.controls), sampler.samples
     count = max(1, min(32, CHUNK // (M * S), len(regions.free)))
     cells = regions.free[np.linspace(0, len(regions.free) - 1, count).astype(int)]
-    controls = slice(0, min(M, max(1, 4 * CHUNK // S)))
-    flat, _, _ = sampler.evaluate(cells, controls)
-    rows = np.sort(flat.reshape(-1, S), axis=1)
-    rows = rows[rows[:, 0] >= 0]
-    return float((np.diff(rows, axis=1) != 0).sum(axis=1).mean() + 1) if len(rows) else 1.0
+    block = Block(0, cells, (0, min(M, max(1, 4 * CHUNK // S))))
+    rows = np.sort(sampler.images(block, sampler.values(block)), axis=1)
+    kept = np.isfinite(rows).all(axis=1)
+    distinct = (np.diff(rows, axis=1) != 0).sum(axis=1) + 1
+    return float(distinct[kept].mean()) if kept.any() else 1.0
 
 
-def _refuse_cost(
-    sampler: Sampler, cells: NDArray[np.int64], controls: slice, bad: NDArray[np.bool_]
-) -> None:
-    width = len(bad) // len(cells)
-    i, a = divmod(int(np.flatnonzero(bad)[0]), width)
-    cell, control = int(cells[i]), int(controls.start) + a
-    values = sampler.values(np.array([cell]), slice(control, control + 1))
+def _refuse_cost(sampler: Sampler, cell: int, control: int) -> None:
+    values = sampler.values(Block(0, np.array([cell]), (control, control + 1)))
     sample = np.asarray(sampler.cost(values)[0])
     faulty = sample[~((sample >= 0) & np.isfinite(sample))].ravel()
     if not len(faulty):
@@ -253,92 +219,22 @@ def _refuse_cost(
 
 
 class _Growing:
-    """An array that grows by reallocation, so that no second copy of it ever exists."""
+    """An array that grows by reallocation, so that no second copy of it ever exists.
 
-    def __init__(self, dtype: Any) -> None:
-        self.data = np.empty(CHUNK, dtype=dtype)
+    Room that is never used is never touched: it takes addresses, not memory.
+    """
+
+    def __init__(self, dtype: Any, room: int) -> None:
+        self.data = np.empty(room, dtype=dtype)
         self.used = 0
 
-    def room(self, count: int) -> NDArray[Any]:
-        if self.used + count > len(self.data):
-            self.data.resize(int(1.25 * (self.used + count)), refcheck=False)
-        return self.data[self.used : self.used + count]
-
-    def keep(self, count: int) -> None:
-        self.used += count
+    def append(self, part: NDArray[Any]) -> None:
+        end = self.used + len(part)
+        if end > len(self.data):
+            self.data.resize(int(1.1 * end), refcheck=False)
+        self.data[self.used : end] = part
+        self.used = end
 
     def array(self) -> NDArray[Any]:
         self.data.resize(self.used, refcheck=False)
         return self.data
-
-
-@njit(
-    types.void(
-        types.Array(types.float64, 4, "A", readonly=True),
-        types.float64[::1],
-        types.float64[:, ::1],
-        types.boolean[:, ::1],
-    ),
-    cache=True,
-    nogil=True,
-)
-def _mean_cost(cost, weights, mean, valid):  # type: ignore[no-untyped-def]
-    """Weighted mean over (points, nodes), and whether every sample is finite and >= 0."""
-    points, nodes = cost.shape[2], cost.shape[3]
-    total = points * weights.sum()
-    for c in range(cost.shape[0]):
-        for a in range(cost.shape[1]):
-            amount, fine = 0.0, True
-            for p in range(points):
-                for q in range(nodes):
-                    g = cost[c, a, p, q]
-                    fine = fine and g >= 0.0 and g < np.inf
-                    amount += weights[q] * g
-            mean[c, a] = amount / total
-            valid[c, a] = fine and mean[c, a] < np.inf
-
-
-@njit(cache=True, nogil=True)
-def _merge(flat, number, group, first_code, lengths, target, code):  # type: ignore[no-untyped-def]
-    """Sort the samples of each pair by (target, group) and count equal ones.
-
-    Writes rows one after the other into target and code, their lengths into ``lengths``
-    (0: inadmissible, nothing written), and returns the number of entries.
-    """
-    pairs, S = flat.shape
-    groups = len(first_code)
-    key = np.empty(S, dtype=np.int64)
-    used = 0
-    for k in range(pairs):
-        escaped = False
-        for s in range(S):
-            cell = flat[k, s]
-            if cell < 0 or number[cell] < 0:
-                escaped = True
-                break
-            value = np.int64(number[cell]) * groups + group[s]
-            if S > 64:
-                key[s] = value
-                continue
-            j = s
-            while j > 0 and key[j - 1] > value:
-                key[j] = key[j - 1]
-                j -= 1
-            key[j] = value
-        lengths[k] = 0
-        if escaped:
-            continue
-        if S > 64:
-            key.sort()
-        start = used
-        s = 0
-        while s < S:
-            run = s + 1
-            while run < S and key[run] == key[s]:
-                run += 1
-            target[used] = key[s] // groups
-            code[used] = first_code[key[s] % groups] + (run - s - 1)
-            used += 1
-            s = run
-        lengths[k] = used - start
-    return used

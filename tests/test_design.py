@@ -28,11 +28,11 @@ systems.*
 systems
 declarations
 problem
-sampling memory threads
+sampling memory threads merging
 linear
 partition rows
 boxes
-regions
+regions sampler
 local
 local_check
 transitions

@@ -221,9 +221,10 @@ def test_memory_is_bounded_by_chunks():
 
 
 def test_controls_in_blocks_equal_controls_at_once(monkeypatch):
-    from lmdsl import transitions
+    from lmdsl import sampler
 
     data = standard_map(8)
     whole = lm.compile(made(data))
-    monkeypatch.setattr(transitions, "CHUNK", 37)
-    assert lm.compile(made(data)).digest == whole.digest
+    for chunk in (1, 37, 999, 2**13):  # one control, some controls, some cells, many cells
+        monkeypatch.setattr(sampler, "CHUNK", chunk)
+        assert lm.compile(made(data)).digest == whole.digest

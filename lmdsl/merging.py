@@ -1,0 +1,168 @@
+"""The assembly kernels: samples of pairs -> rows and mean costs.
+
+The samples of many pairs stand side by side, one lane per pair. So the steps that treat all
+samples alike (sorting, summing the cost) run on vectors of pairs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+
+LANES = 64
+"""Pairs sorted at a time: their keys stay in the first-level cache."""
+
+
+@njit(cache=True, nogil=True)
+def merge(  # type: ignore[no-untyped-def]
+    index, cells_last, mean, number, group, bits, first_code, key,
+    per_cell, control, cost, end, target, code,
+):  # fmt: skip
+    """Turn the image cells of every pair into a row: sorted (target, code), equal ones counted.
+
+    Parameters
+    ----------
+    index
+        Shape (controls, S, cells), or (cells, S, controls) where not ``cells_last``: image cells,
+        NaN where a sample leaves.
+    mean
+        Mean costs, the first and last axis of ``index``, each of its length or 1.
+    number
+        Target of every cell, negative where it counts as leaving, shape (N,).
+    group, bits
+        Group of every sample, shape (S,), below ``2**bits``.
+    first_code
+        Code of one sample of each group; n samples have ``first_code + n - 1``.
+    key
+        Room of shape (S, LANES) for ``target << bits | group``, wide enough for it.
+    per_cell, control, cost, end, target, code
+        Results. Admissible pairs of each cell (zeros on entry); for each of them, ordered by cell,
+        then control, its control, mean cost and the end of its row; the rows one after the other.
+
+    Returns
+    -------
+    pairs, entries : int
+        How many were written.
+    """
+    pairs = entries = 0
+    cells, lanes = len(per_cell), index.shape[0] * index.shape[2]
+    i, j = np.empty((2, LANES), dtype=np.int64)  # the pairs at hand: first and last index
+    a = c = 0
+    for first in range(0, lanes, LANES):
+        count = min(LANES, lanes - first)
+        for k in range(count):
+            i[k], j[k] = (a, c) if cells_last else (c, a)
+            a += 1
+            if a == lanes // cells:
+                a, c = 0, c + 1
+        _keys(index, i, j, count, number, group, bits, key)
+        _sort(key, count)
+        for k in range(count):
+            if key[0, k] >= 0:  # a sample that leaves has a negative key, which comes first
+                entries = _row(key, k, bits, first_code, entries, target, code)
+                per_cell[j[k] if cells_last else i[k]] += 1
+                control[pairs] = i[k] if cells_last else j[k]
+                cost[pairs] = mean[min(i[k], mean.shape[0] - 1), min(j[k], mean.shape[1] - 1)]
+                end[pairs] = entries
+                pairs += 1
+    return pairs, entries
+
+
+@njit(cache=True, nogil=True)
+def _keys(index, i, j, count, number, group, bits, key):  # type: ignore[no-untyped-def]
+    """Gather ``target << bits | group`` of every sample of some pairs."""
+    for s in range(len(key)):
+        for k in range(count):
+            x = index[i[k], s, j[k]]
+            t = number[np.uint64(x)] if x >= 0.0 else -1
+            key[s, k] = (t << bits) | group[s]
+
+
+@njit(cache=True, nogil=True)
+def _sort(key, count):  # type: ignore[no-untyped-def]
+    """Sort each of the first columns by Batcher's merge exchange.
+
+    The same comparisons whatever the keys, so that all columns do them together. (Knuth, The Art
+    of Computer Programming, volume 3, 5.2.2, algorithm M.)
+    """
+    S = len(key)
+    top = 1
+    while 2 * top < S:
+        top *= 2
+    p = top
+    while p > 0:
+        q, r, d = top, 0, p
+        while d > 0:
+            for s in range(S - d):
+                if s & p == r:
+                    _exchange(key[s], key[s + d], count)
+            d, q, r = q - p, q // 2, p
+        p //= 2
+
+
+@njit(cache=True, nogil=True)
+def _exchange(low, high, count):  # type: ignore[no-untyped-def]
+    for i in range(count):
+        a, b = low[i], high[i]
+        low[i] = a if a < b else b
+        high[i] = b if a < b else a
+
+
+@njit(cache=True, nogil=True)
+def _row(key, k, bits, first_code, entries, target, code):  # type: ignore[no-untyped-def]
+    """Append one entry per distinct key of column k; return the new number of entries.
+
+    Every sample overwrites the last entry or begins the next: no branch that depends on the keys.
+    """
+    mask = (1 << bits) - 1
+    last = key[0, k]
+    count = first_code[last & mask]
+    target[entries], code[entries] = last >> bits, count
+    for s in range(1, len(key)):
+        here = key[s, k]
+        count = count + 1 if here == last else first_code[here & mask]
+        entries += 0 if here == last else 1
+        target[entries], code[entries] = here >> bits, count
+        last = here
+    return entries + 1
+
+
+@njit(
+    types.void(
+        types.Array(types.float64, 4, "C", readonly=True),
+        types.int64,
+        types.float64[::1],
+        types.float64[:, ::1],
+    ),
+    cache=True,
+    nogil=True,
+    error_model="numpy",
+)
+def mean_cost(cost, points, weights, mean):  # type: ignore[no-untyped-def]
+    """Average the stage cost over points and nodes, NaN where a sample is negative or not finite.
+
+    Parameters
+    ----------
+    cost
+        Shape (first, points, nodes, last); one point or node stands for all if they cost the same.
+    points
+        Number of points.
+    weights
+        Weights of the nodes.
+    mean
+        Shape (first, last), zeros on entry; the sum of weight times cost, in the order of the
+        samples, over the total weight.
+    """
+    total = points * weights.sum()
+    for i in range(len(mean)):
+        line = mean[i]
+        least = np.zeros(len(line))
+        for p in range(points):
+            for q in range(len(weights)):
+                row = cost[i, min(p, cost.shape[1] - 1), min(q, cost.shape[2] - 1)]
+                for j in range(len(line)):
+                    least[j] = row[j] if row[j] < least[j] else least[j]
+                    line[j] += weights[q] * row[j]
+        for j in range(len(line)):
+            g = line[j] / total  # not finite as soon as one sample is not
+            line[j] = g if (least[j] >= 0.0) & (g < np.inf) else np.nan

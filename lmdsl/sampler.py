@@ -1,0 +1,141 @@
+"""The map and the stage cost at the samples of blocks of cells and controls.
+
+Formulas and users' functions are evaluated on arrays that broadcast to (controls, points, nodes,
+cells), or (cells, points, nodes, controls) where there are more controls than cells. So what does
+not depend on the control is computed once for all controls, and NumPy's inner loops are long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl import sampling
+from lmdsl.merging import mean_cost
+from lmdsl.partition import Partition
+from lmdsl.problem import Problem
+from lmdsl.program import Program
+
+CHUNK = 2**16
+"""Samples evaluated at a time: few enough to stay in cache, many enough to keep threads apart."""
+
+Floats = NDArray[np.float64]
+
+
+class Block(NamedTuple):
+    """Some cells, each with some controls.
+
+    Attributes
+    ----------
+    first
+        Position of the first cell among all cells asked for.
+    cells
+        Indices of the cells in the box.
+    controls
+        The first control and the one after the last.
+    """
+
+    first: int
+    cells: NDArray[np.int64]
+    controls: tuple[int, int]
+
+    @property
+    def width(self) -> int:
+        """Number of controls."""
+        return self.controls[1] - self.controls[0]
+
+    @property
+    def lanes(self) -> int:
+        """Number of pairs."""
+        return self.width * len(self.cells)
+
+    @property
+    def cells_last(self) -> bool:
+        """Whether the last axis of arrays is that of the cells, not of the controls."""
+        return len(self.cells) >= self.width
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The first and last axis of arrays."""
+        cells = len(self.cells)
+        return (self.width, cells) if self.cells_last else (cells, self.width)
+
+
+class Sampler:
+    """Evaluates a problem's map and stage cost at the samples of blocks.
+
+    Attributes
+    ----------
+    points, nodes
+        Sample offsets (points, d) and noise nodes.
+    samples
+        Number of samples S of a pair; sample s is point ``s // nodes`` and node ``s % nodes``.
+    controls
+        Control vectors, shape (M, p).
+    """
+
+    def __init__(self, problem: Problem, partition: Partition) -> None:
+        self.problem, self.partition = problem, partition
+        self.points = sampling.offsets(problem)
+        self.controls = sampling.control_vectors(problem)
+        self.nodes = sampling.noise_nodes(problem)
+        self.samples = len(self.points) * len(self.nodes.weights)
+        self.step = problem.step()
+        self.cost = Program([problem.cost()], problem.system.constants())
+        self._offset = np.ascontiguousarray(self.points.T)[:, :, None]
+        self._control = np.ascontiguousarray(self.controls.T)
+        self._noise = {
+            name: np.ascontiguousarray(self.nodes.values[:, k])[None, None, :, None]
+            for k, name in enumerate(problem.noises)
+        }
+
+    def blocks(self, cells: NDArray[np.int64]) -> Iterator[Block]:
+        """Yield blocks of about CHUNK samples, ordered by cell, then control."""
+        M = len(self.controls)
+        lanes = max(1, CHUNK // self.samples)
+        if lanes >= M:
+            for i in range(0, len(cells), lanes // M):
+                yield Block(i, cells[i : i + lanes // M], (0, M))
+            return
+        for i in range(len(cells)):
+            for a in range(0, M, lanes):
+                yield Block(i, cells[i : i + 1], (a, min(a + lanes, M)))
+
+    def values(self, block: Block) -> dict[str, Floats]:
+        """Return named arrays that broadcast to the samples of a block (see the module)."""
+        cells_last = block.cells_last
+        index = self.partition.multi_index(block.cells)
+        named = {}
+        for k, name in enumerate(self.problem.states):
+            low, width = self.partition.low[k], self.partition.width[k]
+            x = low + (index[k] + self._offset[k]) * width  # (points, cells)
+            named[name] = x[None, :, None, :] if cells_last else x.T.copy()[:, :, None, None]
+        for k, name in enumerate(self.problem.controls):
+            u = self._control[k][block.controls[0] : block.controls[1]]
+            named[name] = u[:, None, None, None] if cells_last else u[None, None, None, :]
+        named.update(self._noise)
+        return named
+
+    def images(self, block: Block, values: Mapping[str, Floats]) -> Floats:
+        """Return the image cells, NaN where a sample leaves, shape (first, S, last)."""
+        index = self.partition.index(self.step(values))
+        first, last = block.shape
+        if index.size != self.samples * block.lanes:
+            shape = (first, len(self.points), len(self.nodes.weights), last)
+            index = np.ascontiguousarray(np.broadcast_to(index, shape))
+        return index.reshape(first, self.samples, last)
+
+    def costs(self, block: Block, values: Mapping[str, Floats]) -> Floats:
+        """Return the mean costs, NaN where that of a sample is negative or not finite.
+
+        The shape is (first, last), with 1 for an axis on which the cost does not depend.
+        """
+        cost = self.cost(values)[0]
+        if cost.ndim < 4:
+            cost = cost.reshape((1,) * (4 - cost.ndim) + cost.shape)
+        mean = np.zeros((cost.shape[0], cost.shape[3]))
+        mean_cost(cost, len(self.points), self.nodes.weights, mean)
+        return mean
