@@ -28,8 +28,19 @@ DENSE = 50
 TOLERANCE = 2e-15
 CEILING = 1e305
 
+Stop = Callable[[], bool]
 
-def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
+
+class Stopped(Exception):
+    """The caller's time is up: no answer, which is not the same as no solution."""
+
+
+def never() -> bool:
+    """Return False: nothing ends the work early."""
+    return False
+
+
+def solve(M: Any, b: Floats, start: Floats | None = None, stop: Stop = never) -> Floats | None:
     """Return x >= 0 with x = b + M x, or None where there is none (as far as rounding can tell).
 
     Parameters
@@ -40,6 +51,13 @@ def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
         Shape (n,), entries >= 0.
     start
         A guess, shape (n,), >= 0.
+    stop
+        Asked after the first few sweeps, then before every sweep and every class.
+
+    Raises
+    ------
+    Stopped
+        ``stop`` said so.
     """
     x = np.array(b if start is None else start, dtype=np.float64)
     if (b == 0).any():
@@ -48,11 +66,11 @@ def solve(M: Any, b: Floats, start: Floats | None = None) -> Floats | None:
     if change <= TOLERANCE:
         return x
     if not _soon(change, rate):
-        direct, small_enough = solve_by_class(M, b)
+        direct, small_enough = solve_by_class(M, b, stop)
         if direct is not None or small_enough:
             return direct
     for _ in range(MAX_SWEEPS // TRIAL_SWEEPS):
-        x, change, rate = _sweep(M, b, x, TRIAL_SWEEPS)
+        x, change, rate = _sweep(M, b, x, TRIAL_SWEEPS, stop)
         if change <= TOLERANCE:
             return x
         if not np.isfinite(change) or x.max() > CEILING:
@@ -73,11 +91,15 @@ def _soon(change: float, rate: float) -> bool:
     return rate < 1 and np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < 300
 
 
-def _sweep(M: Any, b: Floats, x: Floats, count: int) -> tuple[Floats, float, float]:
+def _sweep(
+    M: Any, b: Floats, x: Floats, count: int, stop: Stop = never
+) -> tuple[Floats, float, float]:
     """Sweep; return x, its last relative change, and the factor by which a sweep shrinks it."""
     halfway = last = np.inf
     with np.errstate(all="ignore"):
         for k in range(count):
+            if stop():
+                raise Stopped
             y = b + M @ x
             if k in (count // 2, count - 1):
                 top = float(y.max(initial=0.0))
@@ -88,7 +110,7 @@ def _sweep(M: Any, b: Floats, x: Floats, count: int) -> tuple[Floats, float, flo
     return x, last, rate
 
 
-def solve_by_class(M: Any, b: Floats) -> tuple[Floats | None, bool]:
+def solve_by_class(M: Any, b: Floats, stop: Stop = never) -> tuple[Floats | None, bool]:
     """Solve class by class; return x or None, and whether every class was small enough to try."""
     order, ends = classes(M)
     lengths = np.diff(ends, prepend=0)
@@ -103,6 +125,8 @@ def solve_by_class(M: Any, b: Floats) -> tuple[Floats | None, bool]:
             return None, True
         if k == count:
             break
+        if stop():
+            raise Stopped
         cells = order[until : ends[k]]
         if not _solve_class(M, b, x, cells):
             return None, True

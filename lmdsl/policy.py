@@ -12,19 +12,20 @@ there was changed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import bellman, bounds, graph, linear
+from lmdsl.linear import Stop as Stop
+from lmdsl.linear import Stopped, never
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Stop = Callable[[], bool]
 
 TIE = 1e-12
 """Relative difference in Q up to which two controls count as tied."""
@@ -36,6 +37,7 @@ def evaluate(
     gamma: float | None = None,
     cost: Floats | None = None,
     start: Floats | None = None,
+    stop: Stop = never,
 ) -> Floats | None:
     """Return V = G_u + gamma P_u V, shape (n,); None where the policy has no finite value.
 
@@ -47,13 +49,15 @@ def evaluate(
         Other than the LP's own; ``cost`` has shape (K,).
     start
         A guess of V.
+    stop
+        Ends the work, with :class:`lmdsl.linear.Stopped`.
     """
     gamma = lp.gamma if gamma is None else gamma
     cost = lp.cost if cost is None else cost
     P = lp.rows.matrix(pair)
     if gamma >= 1 and not reaches_attractor(lp, pair, P).all():
         return None
-    return linear.solve(gamma * P, cost[pair], start)
+    return linear.solve(gamma * P, cost[pair], start, stop)
 
 
 def reaches_attractor(lp: StabilizationLP, pair: Pairs, P: object | None = None) -> Bools:
@@ -88,7 +92,7 @@ def iterate(
     value: Floats,
     gamma: float | None = None,
     cost: Floats | None = None,
-    stop: Stop = lambda: False,
+    stop: Stop = never,
     limit: int | None = None,
 ) -> Iteration:
     """Howard's policy iteration from a policy and its value.
@@ -111,7 +115,10 @@ def iterate(
             lowered = np.where(change, better.value, lowered)
         if new is pair:
             return Iteration(pair, value, step, True)
-        new_value = evaluate(lp, new, gamma, cost, lowered)
+        try:
+            new_value = evaluate(lp, new, gamma, cost, lowered, stop)
+        except Stopped:
+            return Iteration(pair, value, step, False)
         if new_value is None or not (new_value < value).any():
             # Rounding made a change look better than it is.
             return Iteration(pair, value, step, True)
@@ -177,7 +184,11 @@ def _columns(lp: StabilizationLP, allowed: Bools):  # type: ignore[no-untyped-de
 
 
 def stability_vector(
-    lp: StabilizationLP, pair: Pairs, guess: Floats | None = None, g: float | None = None
+    lp: StabilizationLP,
+    pair: Pairs,
+    guess: Floats | None = None,
+    g: float | None = None,
+    stop: Stop = never,
 ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return w > 0, d > 0 with w >= g P_u w + d: a proof that the policy is g-stabilizing.
 
@@ -189,7 +200,7 @@ def stability_vector(
     if guess is not None and (d := bounds.decrease(lp, pair, guess, g)) is not None:
         return guess, d
     for inflation in (0.0, 5e-7, 1e-10):
-        w = evaluate(lp, pair, g * (1 + inflation), unit, guess)
+        w = evaluate(lp, pair, g * (1 + inflation), unit, guess, stop)
         if w is not None and (d := bounds.decrease(lp, pair, w, g)) is not None:
             return w, d
     return None, None
@@ -226,48 +237,64 @@ class Undecided:
     lower: float
 
 
-def stabilizing(lp: StabilizationLP, stop: Stop = lambda: False) -> Feasible | Refused | Undecided:
+def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused | Undecided:
     """Find a policy that is stabilizing with weight g = max(gamma, 1), or a proof against it.
 
     Algorithm 1 gives the first policy. Where it does not do, gamma is raised from 1/2 in steps,
     each below the limit of the last policy, under unit cost (under a cost with zeros this can
     stall).
     """
+    reached: Feasible | Refused | Undecided = Undecided(lp.tree[1], 0.0)
+    try:
+        for reached in _raising(lp, stop):
+            if not isinstance(reached, Undecided):
+                break
+    except Stopped:
+        pass
+    return reached
+
+
+def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | Undecided]:
+    """Raise gamma step by step; yield what is known after each, the decision last."""
     g, unit = lp.growth, np.ones(lp.K)
     pair = lp.tree[1]
-    w, _ = stability_vector(lp, pair)
+    w, _ = stability_vector(lp, pair, stop=stop)
     if w is not None:
-        return Feasible(pair, w)
+        yield Feasible(pair, w)
+        return
     # The tree can be exponentially slow; at gamma = 1/2 every policy has a value, at most 2.
-    at, value = 0.5, evaluate(lp, pair, 0.5, unit)
+    at, value = 0.5, evaluate(lp, pair, 0.5, unit, stop=stop)
     if value is None:
-        return Undecided(pair, 0.0)
+        return
     refuse_at = 0
     for step in range(200):
         done = iterate(lp, pair, value, at, unit, stop=stop)
         pair, value = done.pair, done.value
-        w, _ = stability_vector(lp, pair)
+        yield Undecided(pair, at)
+        w, _ = stability_vector(lp, pair, stop=stop)
         if w is not None:
-            return Feasible(pair, w)
+            yield Feasible(pair, w)
+            return
         if stop():
-            break
+            return
         if g > 1 and at >= 1 and step >= refuse_at:
             refuse_at = 2 * step + 4
             proof = refusal(lp, stop)
             if proof is not None:
-                return Refused(proof, pair, at)
+                yield Refused(proof, pair, at)
+                return
         # Raise gamma as far towards g as this policy allows, by bisection from above.
         reach, raised = g, None
         while raised is None and reach > at * (1 + 1e-13):
             reach = at + (reach - at) / 2
-            raised, _ = stability_vector(lp, pair, g=reach)
+            raised, _ = stability_vector(lp, pair, g=reach, stop=stop)
         if raised is None:
-            break
+            return
         at, value = reach, raised
-    return Undecided(pair, at)
+        yield Undecided(pair, at)
 
 
-def refusal(lp: StabilizationLP, stop: Stop = lambda: False) -> Floats | None:
+def refusal(lp: StabilizationLP, stop: Stop = never) -> Floats | None:
     """Return w >= 0, w != 0 that should satisfy w <= gamma P_a w for every pair, or None.
 
     w is the greatest solution of w = min(1, gamma' min_a P_a w) with gamma' just below gamma (the
@@ -320,7 +347,7 @@ def optimal_stopping(
     reward: Floats,
     pair: Pairs | None = None,
     going: Bools | None = None,
-    stop: Stop = lambda: False,
+    stop: Stop = never,
     limit: int = 1000,
 ) -> Stopping | None:
     """Stop in a cell for ``reward``, or go on under the least favourable control, for ever.
@@ -340,16 +367,31 @@ def optimal_stopping(
     stop, limit
         End the work, with None; largest number of steps.
     """
-    zero = np.zeros(lp.K)
     pair = lp.pair_pointer[:-1].copy() if pair is None else pair
     going = np.zeros(lp.n, dtype=np.bool_) if going is None else going
-    w = _stopped(lp, gamma, reward, pair, going)
+    try:
+        return _stopping(lp, gamma, reward, pair, going, stop, limit)
+    except Stopped:
+        return None
+
+
+def _stopping(
+    lp: StabilizationLP,
+    gamma: float,
+    reward: Floats,
+    pair: Pairs,
+    going: Bools,
+    stop: Stop,
+    limit: int,
+) -> Stopping:
+    zero = np.zeros(lp.K)
+    w = _stopped(lp, gamma, reward, pair, going, stop)
     if w is None:
         going = np.zeros(lp.n, dtype=np.bool_)
         w = reward
     for step in range(limit):
         if stop():
-            return None
+            raise Stopped
         lowered, new_pair, new_going = w, pair, going
         for _ in range(step + 1):
             better = bellman.improve(lp, lowered, gamma, zero)
@@ -363,7 +405,7 @@ def optimal_stopping(
             new_going = np.where(change, better.value <= reward, new_going)
         if lowered is w:
             return Stopping(np.minimum(w, reward), pair, going, True)
-        new = _stopped(lp, gamma, reward, new_pair, new_going)
+        new = _stopped(lp, gamma, reward, new_pair, new_going, stop)
         if new is None or not (new < w).any():
             break  # rounding made a change look better than it is
         w, pair, going = new, new_pair, new_going
@@ -371,13 +413,13 @@ def optimal_stopping(
 
 
 def _stopped(
-    lp: StabilizationLP, gamma: float, reward: Floats, pair: Pairs, going: Bools
+    lp: StabilizationLP, gamma: float, reward: Floats, pair: Pairs, going: Bools, stop: Stop
 ) -> Floats | None:
     """Return what a stopping policy is paid: w = gamma P w where it goes, the reward elsewhere."""
     w = reward.copy()
     if going.any():
         P = gamma * lp.rows.matrix(pair[going])
-        new = linear.solve(P[:, going], P[:, ~going] @ reward[~going])
+        new = linear.solve(P[:, going], P[:, ~going] @ reward[~going], stop=stop)
         if new is None:
             return None
         w[going] = new

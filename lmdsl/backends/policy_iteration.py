@@ -11,6 +11,7 @@ import time
 
 from lmdsl import policy
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
+from lmdsl.linear import Stopped
 from lmdsl.lp import StabilizationLP
 
 
@@ -31,7 +32,10 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
             stop = Stop.TIME_LIMIT if late() else Stop.FAILED
             return Solution(stop, stop.name.lower())
         pair = found.pair
-    value = policy.evaluate(lp, pair)
+    try:
+        value = policy.evaluate(lp, pair, stop=late)
+    except Stopped:
+        return Solution(Stop.TIME_LIMIT, "time_limit", pair=pair)
     if value is None:
         return Solution(Stop.FAILED, "the first policy has no finite value")
     done = policy.iterate(lp, pair, value, stop=late, limit=options.max_iterations)
