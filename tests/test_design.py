@@ -33,7 +33,7 @@ regions
 transitions
 graph
 lp
-bellman linear
+bellman linear rational
 bounds
 policy growth
 gamma
