@@ -99,7 +99,8 @@ def iterate(
 
     The k-th step makes k improvement sweeps before it evaluates, so that news from A travels
     further than one cell a step. Each sweep lowers V where a control is strictly better and keeps
-    that control: T_u V <= V stays true, with equality on no recurrent class that was changed.
+    that control: T_u V <= V stays true, with equality on no recurrent class that was changed. The
+    proof that this is safe from any V >= T_u V and ends is in docs/mathematics.md.
     """
     step = 0
     while True:
