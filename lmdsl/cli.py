@@ -365,11 +365,15 @@ def _init(parsed: Arguments) -> int:
 def _backends(parsed: Arguments) -> int:
     from lmdsl import backends
 
-    listed = {}
+    listed: dict[str, dict[str, Any]] = {}
     for name in backends.names():
         try:
             backend = backends.get(name)
-            listed[name] = {"available": True, "algorithms": list(backend.capabilities.algorithms)}
+            listed[name] = {
+                "available": True,
+                "algorithms": list(backend.capabilities.algorithms),
+                "not_installed": backends.missing(backend),
+            }
         except BadInput as error:
             listed[name] = {"available": False, "reason": error.message}
     if parsed.json:
@@ -378,7 +382,14 @@ def _backends(parsed: Arguments) -> int:
     width = max(map(len, listed))
     for name, entry in listed.items():
         if entry["available"]:
-            text = ", ".join(entry["algorithms"]) or "any"  # type: ignore[arg-type]
+            missing = entry["not_installed"]
+            shown_names = [
+                f"{algorithm} (not installed: {missing[algorithm]})"
+                if algorithm in missing
+                else algorithm
+                for algorithm in entry["algorithms"]
+            ]
+            text = ", ".join(shown_names) or "any"
             mark = " (default)" if name == backends.DEFAULT else ""
             print(f"{name.ljust(width)}  algorithms: {text}{mark}")
         else:
