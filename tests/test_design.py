@@ -61,6 +61,8 @@ testing.known testing.report
 testing.probe
 testing.checks
 testing
+cli.output
+cli.*
 cli
 __main__
 """
