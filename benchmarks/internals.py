@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lmdsl as lm
-from lmdsl import bellman, linear, memory, policy, witness
+from lmdsl import bellman, memory, policy, witness
 from lmdsl.partition import Partition
 from lmdsl.rows import Rows, Shares
 from lmdsl.sampling import Nodes
@@ -40,9 +40,9 @@ def improvement_sweep(lp: lm.StabilizationLP, V: NDArray[Any]) -> Callable[[], A
 
 def evaluation_sweep(lp: lm.StabilizationLP, pair: NDArray[Any]) -> Callable[[], Any]:
     """Return one evaluation sweep over the rows of a policy."""
-    M, b = lp.gamma * lp.rows.matrix(pair), lp.cost[pair]
-    x = b.copy()
-    return lambda: linear._sweep(M, b, x, 1)
+    system = lp.rows.system(pair, lp.gamma, lp.cost[pair])
+    x = system.b.copy()
+    return lambda: system.sweep(x, 1)
 
 
 def evaluation(lp: lm.StabilizationLP, pair: NDArray[Any]) -> Callable[[], Any]:

@@ -12,9 +12,7 @@ import contextlib
 import io
 import json
 import os
-import shutil
 import sys
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import memory
+from lmdsl import memory, staging
 from lmdsl.certificate import CLAIMS, Certificate
 from lmdsl.errors import BadInput, shown
 from lmdsl.files import read_json
@@ -102,26 +100,29 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
     target = Path(path).absolute()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{target.name[:40]}.", dir=target.parent))
-        try:
-            whole = work / "new"
-            whole.mkdir()
-            _write(result, whole)
-            with contextlib.suppress(OSError):
-                target.rmdir()  # an empty folder
-            if target.exists():
-                os.rename(target, work / "old")
-            os.rename(whole, target)
-        except BaseException:
-            if (work / "old").exists() and not target.exists():
-                os.rename(work / "old", target)
-            raise
-        finally:
-            if target.exists() or not (work / "old").exists():
-                shutil.rmtree(work, ignore_errors=True)  # never the only copy of an old result
+        staging.clear(target, FILES)
+        with staging.beside(target) as work:
+            _replace(result, target, work)
     except OSError as error:
         reason = (error.strerror or str(error)).lower()
         raise BadInput(f"cannot write {shown(str(path), 200)}: {reason}", "out") from None
+
+
+def _replace(result: Result, target: Path, work: Path) -> None:
+    """Write a result in a work folder, move the old one in and the new one out."""
+    new, old = work / staging.NEW, work / staging.OLD
+    try:
+        new.mkdir()
+        _write(result, new)
+        with contextlib.suppress(OSError):
+            target.rmdir()  # an empty folder
+        if target.exists():
+            os.rename(target, old)
+        os.rename(new, target)
+    except BaseException:
+        if old.exists() and not target.exists():
+            os.rename(old, target)
+        raise
 
 
 def _write(result: Result, folder: Path) -> None:

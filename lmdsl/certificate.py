@@ -25,7 +25,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bounds, policy
+from lmdsl import bounds, policy, rational
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -154,22 +154,11 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
     bound = bounds.total(residual + rounding) * (1 + 4 * bounds.UNIT)
     hopeful = bound - 2 * bounds.total(rounding) <= MEASURE_TOLERANCE < bound
     if hopeful and len(P.data) <= bounds.MAX_EXACT:
-        return _exact_residual(lp, pair, mu)
+        policy_rows = (row for _, row in rational.rows(lp, pair))
+        return rational.rounded_up(
+            rational.residual(lp, policy_rows, [*map(Fraction, mu.tolist())])
+        )
     return bound
-
-
-def _exact_residual(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
-    total, gamma = lp.rows.shares.total, Fraction(lp.gamma)
-    inflow = [Fraction(0)] * (lp.n + 1)
-    for i, k in enumerate(pair):
-        mass = Fraction(float(mu[i]))
-        for j, share in lp.rows.exact(int(k)):
-            inflow[j] += mass * share
-    residual = sum(
-        abs(Fraction(float(lp.weight[j])) - Fraction(float(mu[j])) + gamma * inflow[j] / total)
-        for j in range(lp.n)
-    )
-    return float(np.nextafter(float(min(residual, 1)), math.inf))  # above 1 it is refused anyway
 
 
 def check_refusal(lp: StabilizationLP, w: Floats) -> bool:

@@ -6,15 +6,13 @@ inequality becomes one between integers. Written for clarity: a few microseconds
 
 from __future__ import annotations
 
-import math
-import sys
-from collections.abc import Iterator
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl import rational
 from lmdsl.certificate import (
     MEASURE_TOLERANCE,
     Certificate,
@@ -23,12 +21,9 @@ from lmdsl.certificate import (
     is_policy,
 )
 from lmdsl.lp import StabilizationLP
+from lmdsl.rational import Row, integers, rounded_up
 
 Floats = NDArray[np.float64]
-Row = list[tuple[int, int]]
-
-BLOCK = 2**14
-LARGEST = Fraction(sys.float_info.max)
 
 
 def check_exactly(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
@@ -41,14 +36,14 @@ def check_exactly(lp: StabilizationLP, witness: Witness, tolerance: float) -> Ce
     """
     pair = witness.pair if witness.pair is not None and is_policy(lp, witness.pair) else None
     V_up, W, w, mu = (_exact(lp, x) for x in (witness.V_up, witness.W, witness.w, witness.mu))
-    rows = None if pair is None else [row for _, row in _rows(lp, pair)]
+    rows = None if pair is None else [row for _, row in rational.rows(lp, pair)]
     contraction = None if rows is None or w is None else _contraction(lp, rows, w)
     cost = floor = None
     if rows is not None and pair is not None and V_up is not None and _upper(lp, rows, pair, V_up):
         cost = _mean(lp, V_up)
     if W is not None and _below_all(lp, W, lp.cost):
         floor = _mean(lp, W)
-    residual = None if rows is None or mu is None else _residual(lp, rows, mu)
+    residual = None if rows is None or mu is None else rational.residual(lp, rows, mu)
     gap = None
     if cost is not None and floor is not None:
         gap = (cost - floor) / cost if cost else Fraction(0)
@@ -58,11 +53,11 @@ def check_exactly(lp: StabilizationLP, witness: Witness, tolerance: float) -> Ce
         lower_bound=floor is not None,
         measure=residual is not None and residual <= Fraction(MEASURE_TOLERANCE),
         refusal=pair is None and w is not None and any(w) and _below_all(lp, w, None),
-        contraction=None if contraction is None or contraction >= 1 else _up(contraction),
-        cost=None if cost is None else _up(cost),
-        lower=None if floor is None else -_up(-floor),
-        gap=None if gap is None else max(_up(gap), 0.0),
-        measure_residual=None if residual is None else _up(residual),
+        contraction=None if contraction is None or contraction >= 1 else rounded_up(contraction),
+        cost=None if cost is None else rounded_up(cost),
+        lower=None if floor is None else -rounded_up(-floor),
+        gap=None if gap is None else max(rounded_up(gap), 0.0),
+        measure_residual=None if residual is None else rounded_up(residual),
         tolerance=tolerance,
     )
     return explained(lp, pair, certificate)
@@ -81,35 +76,11 @@ def _mean(lp: StabilizationLP, values: list[Fraction]) -> Fraction:
     )
 
 
-def _up(value: Fraction) -> float:
-    if abs(value) > LARGEST:
-        return math.inf if value > 0 else -sys.float_info.max
-    near = float(value)
-    return near if Fraction(near) >= value else float(np.nextafter(near, math.inf))
-
-
-def _rows(lp: StabilizationLP, columns: NDArray[np.int64]) -> Iterator[tuple[int, Row]]:
-    """Yield (column, [(target in C, numerator), ...]), block by block."""
-    numerator, n = lp.rows.shares.numerator, lp.n
-    for i in range(0, len(columns), BLOCK):
-        block = columns[i : i + BLOCK]
-        taken = lp.rows.take(block)
-        pointer, target, code = taken.pointer.tolist(), taken.target.tolist(), taken.code.tolist()
-        for k, first, last in zip(block.tolist(), pointer[:-1], pointer[1:], strict=True):
-            yield k, [(target[e], numerator[code[e]]) for e in range(first, last) if target[e] < n]
-
-
-def _integers(x: list[Fraction]) -> tuple[list[int], int]:
-    """Return integers a and a shift s with x = a / 2^s."""
-    shift = max((value.denominator.bit_length() - 1 for value in x), default=0)
-    return [value.numerator * (2**shift // value.denominator) for value in x], shift
-
-
 def _contraction(lp: StabilizationLP, rows: list[Row], w: list[Fraction]) -> Fraction | None:
     """Return max g (P_u w) / w exactly: below 1 it proves claim 1; None unless w > 0."""
     if not all(w):
         return None
-    a, _ = _integers(w)
+    a, _ = integers(w)
     worst = max(
         (Fraction(sum(a[j] * s for j, s in row), a[i]) for i, row in enumerate(rows)),
         default=Fraction(0),
@@ -118,7 +89,7 @@ def _contraction(lp: StabilizationLP, rows: list[Row], w: list[Fraction]) -> Fra
 
 
 def _upper(lp: StabilizationLP, rows: Any, pair: NDArray[np.int64], V_up: Any) -> bool:
-    a, shift = _integers(V_up)
+    a, shift = integers(V_up)
     scale, total = Fraction(lp.gamma), lp.rows.shares.total
     cost = lp.cost[pair].tolist()
     return all(
@@ -129,27 +100,13 @@ def _upper(lp: StabilizationLP, rows: Any, pair: NDArray[np.int64], V_up: Any) -
 
 def _below_all(lp: StabilizationLP, x: list[Fraction], cost: Floats | None) -> bool:
     """Decide x <= gamma P_a x + G_a for every surviving pair."""
-    a, shift = _integers(x)
+    a, shift = integers(x)
     p, q = lp.gamma.as_integer_ratio()
     total = lp.rows.shares.total
     left = [value * q * total for value in a]
     unit = q * total * 2**shift
-    for k, row in _rows(lp, np.arange(lp.K, dtype=np.int64)):
+    for k, row in rational.rows(lp, np.arange(lp.K, dtype=np.int64)):
         lacking = left[lp.cell[k]] - p * sum(a[j] * s for j, s in row)
         if lacking > 0 and (cost is None or lacking > Fraction(float(cost[k])) * unit):
             return False
     return True
-
-
-def _residual(lp: StabilizationLP, rows: list[Row], mu: list[Fraction]) -> Fraction:
-    """Return ||m - mu + gamma P_u'mu||_1."""
-    a, shift = _integers(mu)
-    inflow = [0] * lp.n
-    for i, row in enumerate(rows):
-        for j, s in row:
-            inflow[j] += a[i] * s
-    rate = Fraction(lp.gamma) / (lp.rows.shares.total * 2**shift)
-    weight = lp.weight.tolist()
-    return sum(
-        (abs(Fraction(weight[j]) - mu[j] + rate * inflow[j]) for j in range(lp.n)), Fraction(0)
-    )

@@ -20,6 +20,7 @@ just below the limit takes most steps at once, and halving the bracket bounds th
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,10 +28,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lmdsl import bounds, growth, policy
+from lmdsl import bounds, feasibility, growth, policy
 from lmdsl.boxes import Area
 from lmdsl.graph import CellStatus
 from lmdsl.growth import Growth
+from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.transitions import Progress
@@ -151,7 +153,7 @@ def gamma_max(problem: Problem | StabilizationLP, progress: Progress | None = No
     return bracket(lp)
 
 
-def bracket(lp: StabilizationLP, stop: policy.Stop = lambda: False, limit: int = 60) -> GammaBar:
+def bracket(lp: StabilizationLP, stop: Stop = never, limit: int = 60) -> GammaBar:
     """Enclose gamma_bar of a compiled model; ``stop`` ends the work early."""
     if not lp.n:
         nobody = np.empty(0, dtype=np.int64)
@@ -159,50 +161,82 @@ def bracket(lp: StabilizationLP, stop: policy.Stop = lambda: False, limit: int =
     certain = exhausted_by_levels(lp)
     if certain is not None:
         return GammaBar(math.inf, math.inf, certain, None, None, stabilizable=lp.n)
-    best = growth.of_policy(lp, lp.tree[1])
-    low, w_low, proved = 0.0, None, best.pair
-    high, w_high = math.inf, None
-    for _ in range(limit):
-        best = best if stop() else _climbed(lp, best, stop)
-        found = growth.prove_low(lp, best)
-        if found is not None and found[0] > low:
-            low, w_low, proved = *found, best.pair
-        if stop():
-            break
-        needed = check_high(lp, best.slow_vector)
-        if needed is not None and needed < high:
-            high, w_high = needed, best.slow_vector
-        closed = high <= low * (1 + WIDTH)
-        better = None
-        for step in STEPS[:1] if closed else STEPS:
-            answer = _beyond(lp, best, best.limit * (1 + step), stop)
+    search = _Search(lp, stop, lp.tree[1])
+    with suppress(Stopped):
+        search.run(limit)
+    return search.found()
+
+
+class _Search:
+    """The bracket while it narrows: both ends, their vectors, and the best policy so far."""
+
+    def __init__(self, lp: StabilizationLP, stop: Stop, pair: Pairs) -> None:
+        self.lp, self.stop, self.pair = lp, stop, pair
+        self.low, self.high = 0.0, math.inf
+        self.w_low: Floats | None = None
+        self.w_high: Floats | None = None
+        self.best: Growth | None = None
+
+    @property
+    def closed(self) -> bool:
+        return self.high <= self.low * (1 + WIDTH)
+
+    def run(self, limit: int) -> None:
+        """Narrow the bracket until it closes, or doubles decide no more."""
+        best = growth.of_policy(self.lp, self.pair, self.stop)
+        for _ in range(limit):
+            if not self.stop():
+                best = _climbed(self.lp, best, self.stop)
+            self._raise_low(best)
+            if self.stop():
+                return
+            self._take(check_high(self.lp, best.slow_vector), best.slow_vector)
+            closed, better = self.closed, None
+            for step in STEPS[:1] if closed else STEPS:
+                answer = _beyond(self.lp, best, best.limit * (1 + step), self.stop)
+                if isinstance(answer, Growth):
+                    better = answer
+                    break
+                if answer is not None:
+                    # Of two vectors that close it, that of optimal stopping names all cells.
+                    self._take(*answer, closed and answer[0] <= self.low * (1 + WIDTH))
+                    break
+            if better is None or self.closed:
+                return
+            best = better
+            # Halve the bracket too, so that many small gains cannot make it long.
+            top = self.high if math.isfinite(self.high) else 4 * best.limit
+            answer = _beyond(self.lp, best, math.sqrt(best.limit * top), self.stop)
             if isinstance(answer, Growth):
-                better = answer
-                break
-            if answer is not None:
-                # Of two vectors that close the bracket the one of optimal stopping names all cells.
-                if answer[0] < high or (closed and answer[0] <= low * (1 + WIDTH)):
-                    high, w_high = answer
-                break
-        if better is None or high <= low * (1 + WIDTH):
-            break
-        best = better
-        # Halve the bracket too, so that many small gains cannot make it long.
-        top = high if math.isfinite(high) else 4 * best.limit
-        answer = _beyond(lp, best, math.sqrt(best.limit * top), stop)
-        if isinstance(answer, Growth):
-            best = answer
-        elif answer is not None and answer[0] < high:
-            high, w_high = answer
-    note = ""
-    if high > low * (1 + WIDTH):
-        note = "the vectors leave the range of doubles; the bracket is as tight as they allow"
-        note = "the work was ended before the bracket closed" if stop() else note
-    beyond = limiting = None
-    if w_high is not None:
-        core, high = _core(lp, best, w_high, high, low * (1 + WIDTH), stop)
-        beyond, limiting = (Area.of(lp.partition, lp.cells[w > 0]) for w in (w_high, core))
-    return GammaBar(low, high, proved, w_low, w_high, note, beyond, limiting, lp.n)
+                best = answer
+            elif answer is not None:
+                self._take(*answer)
+
+    def _raise_low(self, best: Growth) -> None:
+        self.best = best
+        proved = growth.prove_low(self.lp, best)
+        if proved is not None and proved[0] > self.low:
+            self.low, self.w_low = proved
+            self.pair = best.pair
+
+    def _take(self, high: float | None, w: Floats, anyway: bool = False) -> None:
+        if high is not None and (high < self.high or anyway):
+            self.high, self.w_high = high, w
+
+    def found(self) -> GammaBar:
+        """Return the bracket, and the cells behind its upper end."""
+        lp, high, note = self.lp, self.high, ""
+        if not self.closed:
+            note = "the vectors leave the range of doubles; the bracket is as tight as they allow"
+            note = "the work was ended before the bracket closed" if self.stop() else note
+        beyond = limiting = None
+        if self.w_high is not None and self.best is not None:
+            most = max(high, self.low * (1 + WIDTH))
+            core, high = _core(lp, self.best, self.w_high, high, most, self.stop)
+            beyond, limiting = (Area.of(lp.partition, lp.cells[w > 0]) for w in (self.w_high, core))
+        return GammaBar(
+            self.low, high, self.pair, self.w_low, self.w_high, note, beyond, limiting, lp.n
+        )
 
 
 def check_high(lp: StabilizationLP, w: Floats) -> float | None:
@@ -224,24 +258,24 @@ def exhausted_by_levels(lp: StabilizationLP) -> Pairs | None:
     return pair if (pair >= 0).all() else None
 
 
-def _climbed(lp: StabilizationLP, start: Growth, stop: policy.Stop) -> Growth:
+def _climbed(lp: StabilizationLP, start: Growth, stop: Stop) -> Growth:
     """Improve a policy under unit cost just below its limit, where its value fits into doubles."""
     unit = np.ones(lp.K)
     for below in (1e-3, 0.1):
         at = start.limit * (1 - below)
-        value = policy.evaluate(lp, start.pair, at, unit)
+        value = policy.evaluate(lp, start.pair, at, unit, stop=stop)
         if value is None:
             continue
         done = policy.iterate(lp, start.pair, value, at, unit, stop=stop)
         if not done.steps:
             return start
-        found = growth.of_policy(lp, done.pair)
+        found = growth.of_policy(lp, done.pair, stop)
         return found if found.limit > start.limit else start
     return start
 
 
 def _beyond(
-    lp: StabilizationLP, start: Growth, gamma: float, stop: policy.Stop
+    lp: StabilizationLP, start: Growth, gamma: float, stop: Stop
 ) -> Growth | tuple[float, Floats] | None:
     """Decide a gamma: a policy that is stabilizing there, or a proved high and its vector.
 
@@ -249,11 +283,11 @@ def _beyond(
     ``start`` does not grow.
     """
     going = start.rate * gamma < 1 - 1e-12
-    found = policy.optimal_stopping(lp, gamma, np.ones(lp.n), start.pair, going, stop)
+    found = feasibility.optimal_stopping(lp, gamma, np.ones(lp.n), start.pair, going, stop)
     if found is None:
         return None
     if not found.refuses:
-        better = growth.of_policy(lp, found.pair) if found.going.all() else None
+        better = growth.of_policy(lp, found.pair, stop) if found.going.all() else None
         return better if better is not None and better.limit > start.limit else None
     # Small entries may be rounding, or what carries a vector that falls over many decades.
     answers = [(check_high(lp, w) or math.inf, w) for w in (found.carried, found.w)]
@@ -267,7 +301,7 @@ def _core(
     w_high: Floats,
     high: float,
     most: float,
-    stop: policy.Stop,
+    stop: Stop,
 ) -> tuple[Floats, float]:
     """Return an upper vector on the slowest classes alone, and a high that holds for it too.
 
@@ -276,18 +310,18 @@ def _core(
     dodge from one slow class to another), w_high itself serves.
     """
     needed = check_high(lp, best.slow_vector)
-    if needed is not None and needed <= max(most, high):
+    if needed is not None and needed <= most:
         return best.slow_vector, max(high, needed)
     reward = np.where(best.slowest & (w_high > 0), 1.0, 0.0)
     if (reward[w_high > 0] > 0).all():
         return w_high, high
     for gamma in (high, high * (1 + 0.1 * WIDTH)):
-        found = policy.optimal_stopping(lp, gamma, reward, stop=stop)
+        found = feasibility.optimal_stopping(lp, gamma, reward, stop=stop)
         if found is None:
             break
         core = np.where(reward > 0, found.carried, 0.0)
         needed = check_high(lp, core) if found.refuses else None
-        if needed is not None and needed <= max(most, high):
+        if needed is not None and needed <= most:
             return core, max(high, needed)
     return w_high, high
 

@@ -18,6 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bounds, linear
+from lmdsl.linear import Stop, never
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -75,7 +76,7 @@ class Growth:
         return np.where(self.slowest, self.x, 0.0)
 
 
-def of_policy(lp: StabilizationLP, pair: Pairs) -> Growth:
+def of_policy(lp: StabilizationLP, pair: Pairs, stop: Stop = never) -> Growth:
     """Take a policy apart into classes and estimate the spectral radius of each."""
     P = lp.rows.matrix(pair)
     order, ends = linear.classes(P)
@@ -83,11 +84,11 @@ def of_policy(lp: StabilizationLP, pair: Pairs) -> Growth:
     lengths = np.diff(ends, prepend=0)
     for k in np.flatnonzero(lengths > 1):
         cells = order[ends[k] - lengths[k] : ends[k]]
-        x[cells], rate[cells] = _perron(P[cells][:, cells])
+        x[cells], rate[cells] = _perron(P[cells][:, cells], stop)
     return Growth(pair, P, order, ends, x, rate)
 
 
-def _perron(inner: Any, steps: int = 100) -> tuple[Floats, float]:
+def _perron(inner: Any, stop: Stop, steps: int = 100) -> tuple[Floats, float]:
     """Return x > 0 and the largest (M x)_i / x_i for an irreducible M >= 0, close to rho(M).
 
     For a bound at > rho, y = (I - M/at)^-1 x is positive and (M y)_i / y_i < at. Noda's iteration
@@ -109,7 +110,7 @@ def _perron(inner: Any, steps: int = 100) -> tuple[Floats, float]:
             break
         # A little off top, so that the last steps are not singular.
         at = (top + bottom) / 2 if halve else top * (1 + 1e-9)
-        y = _solved(M / at, x)
+        y = _solved(M / at, x, stop)
         if y is None:
             if not halve:
                 break
@@ -128,7 +129,7 @@ def _perron(inner: Any, steps: int = 100) -> tuple[Floats, float]:
     return x, top
 
 
-def _solved(M: Any, x: Floats) -> Floats | None:
+def _solved(M: Any, x: Floats, stop: Stop) -> Floats | None:
     """Return y = x + M y, largest entry 1, None where it is not positive or leaves doubles."""
     if isinstance(M, np.ndarray):
         try:
@@ -136,7 +137,7 @@ def _solved(M: Any, x: Floats) -> Floats | None:
         except np.linalg.LinAlgError:
             return None
     else:
-        y = linear.solve(M, x)
+        y = linear.solve(M, x, stop=stop)
     if y is None or not np.isfinite(y).all() or not y.min() > 0:
         return None
     y = x + M @ y  # sums of positive numbers: every entry to its own precision

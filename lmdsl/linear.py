@@ -30,6 +30,17 @@ TOLERANCE = 2e-15
 CEILING = 1e305
 NEVER = 1e308
 
+Stop = Callable[[], bool]
+
+
+class Stopped(Exception):
+    """The caller's time is up: no answer, which is not the same as no solution."""
+
+
+def never() -> bool:
+    """Return False: nothing ends the work early."""
+    return False
+
 
 @dataclass(frozen=True)
 class System:
@@ -72,7 +83,11 @@ class System:
 
 
 def solve(
-    M: Any, b: Floats, start: Floats | None = None, enough: float = TOLERANCE
+    M: Any,
+    b: Floats,
+    start: Floats | None = None,
+    enough: float = TOLERANCE,
+    stop: Stop = never,
 ) -> Floats | None:
     """Return x >= 0 with x = b + M x, or None where there is none (as far as rounding can tell).
 
@@ -86,25 +101,38 @@ def solve(
         A guess, shape (n,), >= 0.
     enough
         Relative change of a sweep that ends the work.
+    stop
+        Asked after the first few sweeps, then again and again between sweeps and classes.
+
+    Raises
+    ------
+    Stopped
+        ``stop`` said so.
     """
     x = np.array(b if start is None else start, dtype=np.float64)
     if (b == 0).any():
         x[~_pays(M, b)] = 0.0  # exactly: a guess would only fade there
-    return solve_from(System.of(M, b), x, lambda: M, enough)
+    return solve_from(System.of(M, b), x, lambda: M, enough, stop)
 
 
 def solve_from(
-    system: System, x: Floats, matrix: Callable[[], Any], enough: float = TOLERANCE
+    system: System,
+    x: Floats,
+    matrix: Callable[[], Any],
+    enough: float = TOLERANCE,
+    stop: Stop = never,
 ) -> Floats | None:
     """Solve from a guess, which is overwritten; ``matrix`` makes M where sweeps are slow."""
     change, rate = _trial(system, x, enough)
     if change <= enough:
         return x
     if not _soon(change, rate):
-        direct, small_enough = solve_by_class(matrix(), system.b)
+        direct, small_enough = solve_by_class(matrix(), system.b, stop)
         if direct is not None or small_enough:
             return direct
     for _ in range(MAX_SWEEPS // TRIAL_SWEEPS):
+        if stop():
+            raise Stopped
         change, rate = _trial(system, x, enough)
         if change <= enough:
             return x
@@ -135,7 +163,7 @@ def _trial(system: System, x: Floats, enough: float) -> tuple[float, float]:
     return last, rate
 
 
-def solve_by_class(M: Any, b: Floats) -> tuple[Floats | None, bool]:
+def solve_by_class(M: Any, b: Floats, stop: Stop = never) -> tuple[Floats | None, bool]:
     """Solve class by class; return x or None, and whether every class was small enough to try."""
     order, ends = classes(M)
     lengths = np.diff(ends, prepend=0)
@@ -150,6 +178,8 @@ def solve_by_class(M: Any, b: Floats) -> tuple[Floats | None, bool]:
             return None, True
         if k == count:
             break
+        if stop():
+            raise Stopped
         cells = order[until : ends[k]]
         if not _solve_class(M, b, x, cells):
             return None, True

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import backends, bellman, certificate, gamma, policy
+from lmdsl import backends, bellman, certificate, feasibility, gamma, policy
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.scaled import failure
 from lmdsl.certificate import Certificate, Verified, Witness
@@ -87,8 +87,8 @@ def solve(
     def late() -> bool:
         return deadline is not None and time.monotonic() > deadline
 
-    first = policy.stabilizing(lp, late)
-    if isinstance(first, policy.Refused):
+    first = feasibility.stabilizing(lp, late)
+    if isinstance(first, feasibility.Refused):
         verified = _refuse(lp, first, tolerance)
         w = verified.witness.w
         if verified.certificate.refusal and w is not None:
@@ -110,17 +110,17 @@ def solve(
             bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
             message = gamma.refusal_message(lp, w, limits, bracket)
             return job.refused("gamma", message, verified, bracket)
-        first = policy.Undecided(first.pair, first.lower)
+        first = feasibility.Undecided(first.pair, first.lower)
     options = Options(
         tolerance=tolerance,
-        time_limit=None if deadline is None else max(deadline - time.monotonic(), 1e-3),
+        time_limit=None if deadline is None else max(deadline - time.monotonic(), 1e-9),
         max_iterations=max_iterations,
         algorithm=algorithm,
         start=first.pair,
-        proof=first.w if isinstance(first, policy.Feasible) else None,
+        proof=first.w if isinstance(first, feasibility.Feasible) else None,
         progress=progress,
     )
-    if isinstance(first, policy.Undecided):
+    if isinstance(first, feasibility.Undecided):
         word = "time limit" if late() else "undecided"
         stop = Stop.TIME_LIMIT if late() else Stop.FAILED
         solution = Solution(stop, word, pair=first.pair)
@@ -135,7 +135,7 @@ def solve(
     started = time.perf_counter()
     verified = certify(lp, outcome.pair, tolerance, outcome.value)
     job.verify_seconds = time.perf_counter() - started
-    undecided = isinstance(first, policy.Undecided) and not late()
+    undecided = isinstance(first, feasibility.Undecided) and not late()
     return job.solved(solution, outcome, verified, undecided)
 
 
@@ -170,7 +170,7 @@ def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[str, str]
     return None
 
 
-def _refuse(lp: StabilizationLP, found: policy.Refused, tolerance: float) -> Verified:
+def _refuse(lp: StabilizationLP, found: feasibility.Refused, tolerance: float) -> Verified:
     from lmdsl.bounds import lower_until_below
 
     w = lower_until_below(lp, found.w, lp.gamma, None)

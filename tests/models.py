@@ -10,7 +10,7 @@ from problems import made, steps
 import lmdsl as lm
 from lmdsl import graph
 from lmdsl.partition import Partition
-from lmdsl.rows import Rows, Shares
+from lmdsl.rows import Rows, Shares, code_type
 from lmdsl.sampling import Nodes
 
 
@@ -122,7 +122,7 @@ def mdp(cells, samples: int, gamma: float) -> lm.StabilizationLP:
     compact = Rows(
         pointer,
         np.array([j for row in rows for j in row], dtype=np.int32),
-        np.array([c - 1 for row in rows for c in row.values()], dtype=np.uint8),
+        np.array([c - 1 for row in rows for c in row.values()], dtype=code_type(samples)),
         shares,
         n,
     )

@@ -4,6 +4,7 @@ Driven by one table: a new backend adds its specs there, no test. The standard m
 policy iteration.
 """
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -12,12 +13,14 @@ from functools import cache
 import numpy as np
 import pytest
 
+from lmdsl import backends
 from lmdsl import lp as model
 from lmdsl.backends import BUILT_IN, Options, Solution, Stop, get, names, resolve
 from lmdsl.backends import clarabel as clarabel_backend
 from lmdsl.backends import cvxpy as cvxpy_backend
 from lmdsl.backends import highs as highs_backend
 from lmdsl.backends.scaled import ScaledLP, failure
+from lmdsl.cli import main
 from lmdsl.errors import BadInput, MissingDependency
 from lmdsl.lp import StabilizationLP
 from lmdsl.problem import Problem
@@ -276,3 +279,22 @@ def test_no_solver_is_imported_unasked():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_an_algorithm_that_is_not_installed_is_listed_as_such(monkeypatch, capsys):
+    def none(name):
+        raise backends.PackageNotFoundError(name)
+
+    highs = get("highs")
+    monkeypatch.setattr(backends, "version", none)
+    assert backends.missing(highs) == {"hipo": "highspy-extras"}
+    assert main(["backends"]) == 0
+    assert "simplex, hipo (not installed: highspy-extras), pdlp" in capsys.readouterr().out
+    assert main(["backends", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert listed["highs"]["not_installed"] == {"hipo": "highspy-extras"}
+    assert listed["clarabel"]["not_installed"] == {}
+    monkeypatch.setattr(backends, "version", lambda _: "1.0")
+    assert backends.missing(highs) == {}
+    assert main(["backends"]) == 0
+    assert "not installed" not in capsys.readouterr().out

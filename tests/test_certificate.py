@@ -13,7 +13,7 @@ from models import dense, random_lp
 from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl import policy, witness
+from lmdsl import feasibility, policy, witness
 from lmdsl.bounds import exactly_below, holds_for_all
 from lmdsl.certificate import Witness, check
 from lmdsl.exact import check_exactly
@@ -24,7 +24,7 @@ from lmdsl.rows import Rows
 def solved():
     """The standard map on 20 x 20 cells, its witness and certificate."""
     lp = lm.compile(made(standard_map(20)))
-    found = policy.stabilizing(lp)
+    found = feasibility.stabilizing(lp)
     done = policy.iterate(lp, found.pair, policy.evaluate(lp, found.pair))
     verified = witness.certify(lp, done.pair, 1e-6, done.value)
     assert verified.certificate.verified

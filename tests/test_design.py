@@ -17,7 +17,7 @@ PACKAGE = Path(lm.__file__).parent
 # Data flows one way: a module imports only from modules on an earlier line.
 ORDER = """
 errors
-files
+files staging
 formulas
 intervals
 jets
@@ -38,10 +38,11 @@ local_check
 transitions
 graph
 lp
-bellman
+bellman rational
 screening
 bounds
 policy growth
+feasibility
 gamma
 backends.base
 backends.scaled
@@ -67,6 +68,8 @@ testing.known testing.report
 testing.probe
 testing.checks
 testing
+cli.output
+cli.*
 cli
 __main__
 """

@@ -7,7 +7,7 @@ import pytest
 from models import brute_force, dense, mdp, random_lp
 
 import lmdsl as lm
-from lmdsl import policy
+from lmdsl import feasibility, policy
 from lmdsl.bounds import exactly_below
 
 
@@ -92,8 +92,8 @@ def test_canonical_policy_does_not_depend_on_the_start(seed):
     lp = random_lp(rng, cells=7, controls=4, gamma=1.0, zero=0.8, samples=4)
     if not lp.n:
         return
-    found = policy.stabilizing(lp)
-    assert isinstance(found, policy.Feasible)
+    found = feasibility.stabilizing(lp)
+    assert isinstance(found, feasibility.Feasible)
     ends = []
     for start in (found.pair, _random_proper(lp, rng)):
         value = policy.evaluate(lp, start)

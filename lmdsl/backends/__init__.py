@@ -6,7 +6,7 @@ An entry point names a :class:`Backend`. Nothing is imported before it is asked 
 from __future__ import annotations
 
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
 from importlib.util import find_spec
 
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
@@ -20,7 +20,17 @@ BUILT_IN = {
 }
 DEFAULT = "policy-iteration"
 
-__all__ = ["Backend", "Capabilities", "Options", "Solution", "Stop", "get", "names", "resolve"]
+__all__ = [
+    "Backend",
+    "Capabilities",
+    "Options",
+    "Solution",
+    "Stop",
+    "get",
+    "missing",
+    "names",
+    "resolve",
+]
 
 
 def names() -> tuple[str, ...]:
@@ -53,6 +63,20 @@ def get(name: str) -> Backend:
         if find_spec(package) is None:
             raise MissingDependency(f"{name} needs the package {package}; install it", "backend")
     return backend
+
+
+def missing(backend: Backend) -> dict[str, str]:
+    """Return the algorithms of a backend whose distribution is not installed, with its name.
+
+    Nothing is imported; an installation that has the algorithm built in can still run it.
+    """
+    found = {}
+    for algorithm, distribution in backend.capabilities.extras.items():
+        try:
+            version(distribution)
+        except PackageNotFoundError:
+            found[algorithm] = distribution
+    return found
 
 
 def resolve(spec: str | Backend) -> tuple[Backend, str | None]:

@@ -54,6 +54,8 @@ class Capabilities:
     ----------
     algorithms
         Values of ``Options.algorithm``, the default first.
+    extras
+        Algorithms that need one more distribution, by name; shown as not installed without it.
     vertex
         Its occupation measure is a vertex: at most one positive entry per cell.
     rays
@@ -71,6 +73,7 @@ class Capabilities:
     tolerance: bool = True
     time_limit: bool = True
     iteration_limit: bool = True
+    extras: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

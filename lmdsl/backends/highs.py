@@ -138,4 +138,9 @@ def _model(highspy: Any, scaled: ScaledLP) -> Any:
     return model
 
 
-BACKEND = Backend("highs", solve, Capabilities(algorithms=tuple(ALGORITHMS)), ("highspy",))
+BACKEND = Backend(
+    "highs",
+    solve,
+    Capabilities(algorithms=tuple(ALGORITHMS), extras={"hipo": "highspy-extras"}),
+    ("highspy",),
+)

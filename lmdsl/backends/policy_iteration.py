@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import time
 
-from lmdsl import policy
+from lmdsl import feasibility, policy
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
+from lmdsl.linear import Stopped
 from lmdsl.lp import StabilizationLP
 
 
@@ -24,16 +25,19 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
 
     pair, w = options.start, options.proof
     if pair is None:
-        found = policy.stabilizing(lp, late)
-        if isinstance(found, policy.Refused):
+        found = feasibility.stabilizing(lp, late)
+        if isinstance(found, feasibility.Refused):
             return Solution(Stop.INFEASIBLE, "infeasible")
-        if isinstance(found, policy.Undecided):
+        if isinstance(found, feasibility.Undecided):
             stop = Stop.TIME_LIMIT if late() else Stop.FAILED
             return Solution(stop, stop.name.lower())
         pair, w = found.pair, found.w
-    value = policy.bound(lp, pair, w)
-    if value is None:
-        value = policy.evaluate(lp, pair)
+    try:
+        value = policy.bound(lp, pair, w)
+        if value is None:
+            value = policy.evaluate(lp, pair, stop=late)
+    except Stopped:
+        return Solution(Stop.TIME_LIMIT, "time_limit", pair=pair)
     if value is None:
         return Solution(Stop.FAILED, "the first policy has no finite value")
     done = policy.iterate(lp, pair, value, stop=late, limit=options.max_iterations)

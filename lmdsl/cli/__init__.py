@@ -1,0 +1,90 @@
+"""The command line: ``lmdsl solve FILE`` and its companions.
+
+Exit status, the first that applies: 2 bad input or usage; 3 not stabilizable; 0 verified; 4 a
+solver failed or hit its limit; 1 solved but not verified. Results go to stdout, everything else
+(progress, errors) to stderr; an error is one message, never a traceback. Each group of commands has
+its module; what a command needs is imported when it runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from lmdsl.cli import feasibility, listing, results, solving
+from lmdsl.cli.output import Arguments, Run, print_json
+from lmdsl.errors import LmdslError, shown
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit status."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        parsed = _parser().parse_args(arguments)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    try:
+        status = int(parsed.run(parsed))
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        # The reader of our output went away: not an error of ours, and nobody to tell.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return int(getattr(parsed, "status", 0))
+    except KeyboardInterrupt:
+        return _fail("interrupted", 130)
+    except MemoryError:
+        return _bad(parsed, "out of memory; use fewer cells, controls or sample points")
+    except LmdslError as error:
+        return _bad(parsed, str(error))
+    except Exception as error:
+        if os.environ.get("LMDSL_DEBUG"):
+            raise
+        what = f"internal error: {type(error).__name__}: {shown(str(error), 200)}"
+        return _fail(f"{what}; please report it (LMDSL_DEBUG=1 shows where)", 4)
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"lmdsl: {message}", file=sys.stderr)
+    return status
+
+
+def _bad(parsed: Arguments, message: str) -> int:
+    if getattr(parsed, "json", False):
+        from lmdsl.result import Report
+
+        report: dict[str, Any] = Report(status="bad_input", message=message).to_dict()
+        if parsed.command == "compare":
+            report = {"results": [report], "agreement": None}
+        elif parsed.command != "solve":
+            report = {"status": "bad_input", "message": message}
+        print_json(report)
+    return _fail(message, 2)
+
+
+def _parser() -> argparse.ArgumentParser:
+    from lmdsl import __version__
+
+    parser = argparse.ArgumentParser(
+        prog="lmdsl",
+        description="Optimal stabilization with Lyapunov measures, verified.",
+        epilog="Exit status: 0 verified, 1 not verified, 2 bad input, 3 not stabilizable, "
+        "4 a solver failed or hit its limit.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"lmdsl {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, run: Run, text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+        sub.set_defaults(run=run)
+        return sub
+
+    for group in (solving, results, feasibility, listing):
+        group.add(command)
+    return parser

@@ -1,0 +1,54 @@
+"""``gamma-max`` and ``explain``: what can be stabilized, and why the rest cannot."""
+
+from __future__ import annotations
+
+from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json, safe
+
+
+def add(command: Command) -> None:
+    """Add the commands of this module."""
+    limit = command("gamma-max", _gamma_max, "Enclose the largest feasible gamma.")
+    limit.add_argument("file", metavar="FILE", help="problem file")
+    as_json(limit)
+
+    explain = command("explain", _explain, "Say which cells cannot be stabilized, why, and what "
+                      "would help.")  # fmt: skip
+    explain.add_argument("file", metavar="FILE", help="problem file")
+    explain.add_argument("--phase-one", action="store_true",
+                         help="phase-one LP: how much mass cannot be stabilized")  # fmt: skip
+    explain.add_argument("--time-limit", type=float, metavar="S", help="seconds for that LP")
+    as_json(explain)
+
+
+def _gamma_max(parsed: Arguments) -> int:
+    from lmdsl.gamma import gamma_max
+    from lmdsl.problem import load
+
+    problem = load(parsed.file)
+    with Progress() as progress:
+        found = gamma_max(problem, progress)
+    if parsed.json:
+        print_json(found.to_dict())
+    else:
+        print(found.text())
+    return 0 if found.stabilizable else 3
+
+
+def _explain(parsed: Arguments) -> int:
+    from lmdsl.explanation import explain
+    from lmdsl.problem import load
+
+    problem = load(parsed.file)
+    with Progress() as progress:
+        found = explain(
+            problem,
+            phase_one=parsed.phase_one,
+            time_limit=parsed.time_limit,
+            progress=progress,
+        )
+        text = "" if parsed.json else found.text()
+    if parsed.json:
+        print_json(found.to_dict())
+    else:
+        print("\n".join(safe(line) for line in text.splitlines()))
+    return 0

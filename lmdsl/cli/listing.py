@@ -1,0 +1,94 @@
+"""What there is, and where to start: ``schema``, ``systems``, ``init``, ``backends``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lmdsl.cli.output import Arguments, Command, as_json, print_json, safe
+from lmdsl.errors import BadInput, shown
+
+
+def add(command: Command) -> None:
+    """Add the commands of this module."""
+    command("schema", _schema, "Print the JSON Schema of the problem file.")
+    as_json(command("systems", _systems, "List the systems known by name."))
+    init = command("init", _init, "Write the default problem of a named system.")
+    init.add_argument("name", metavar="NAME", help="a system (see `lmdsl systems`)")
+    init.add_argument("--out", metavar="FILE", help="file to write (default NAME.json)")
+    as_json(command("backends", _backends, "List the backends."))
+
+
+def _schema(parsed: Arguments) -> int:
+    from lmdsl.problem import json_schema
+
+    print_json(json_schema(), indent=2)
+    return 0
+
+
+def _systems(parsed: Arguments) -> int:
+    from lmdsl.systems import NAMED
+
+    if parsed.json:
+        entries = {
+            name: {"summary": s.summary, "source": s.source, "parameters": dict(s.defaults)}
+            for name, s in NAMED.items()
+        }
+        print_json(entries, indent=2)
+        return 0
+    width = max(map(len, NAMED))
+    for name, system in NAMED.items():
+        print(f"{name.ljust(width)}  {system.summary}")
+        print(f"{' ' * width}    {system.source}")
+    return 0
+
+
+def _init(parsed: Arguments) -> int:
+    from lmdsl.files import write_whole
+    from lmdsl.problem import Problem
+    from lmdsl.systems import NAMED
+
+    if parsed.name not in NAMED:
+        raise BadInput(f"{shown(parsed.name)} is not a system; known: {', '.join(NAMED)}", "NAME")
+    path = Path(parsed.out if parsed.out is not None else f"{parsed.name}.json")
+    if path.exists():
+        raise BadInput(f"{shown(str(path), 200)} exists; remove it or choose another name", "out")
+    problem: Problem = Problem.model_validate(NAMED[parsed.name].problem)
+    write_whole(path, problem.to_json().encode())
+    print(f"written to {safe(str(path))}; next: lmdsl solve {safe(str(path))} --out out")
+    return 0
+
+
+def _backends(parsed: Arguments) -> int:
+    from lmdsl import backends
+
+    listed: dict[str, dict[str, Any]] = {}
+    for name in backends.names():
+        try:
+            backend = backends.get(name)
+            listed[name] = {
+                "available": True,
+                "algorithms": list(backend.capabilities.algorithms),
+                "not_installed": backends.missing(backend),
+            }
+        except BadInput as error:
+            listed[name] = {"available": False, "reason": error.message}
+    if parsed.json:
+        print_json(listed, indent=2)
+        return 0
+    width = max(map(len, listed))
+    for name, entry in listed.items():
+        if entry["available"]:
+            missing = entry["not_installed"]
+            shown_names = [
+                f"{algorithm} (not installed: {missing[algorithm]})"
+                if algorithm in missing
+                else algorithm
+                for algorithm in entry["algorithms"]
+            ]
+            text = ", ".join(shown_names) or "any"
+            mark = " (default)" if name == backends.DEFAULT else ""
+            print(f"{name.ljust(width)}  algorithms: {text}{mark}")
+        else:
+            print(f"{name.ljust(width)}  not available: {entry['reason']}")
+    return 0

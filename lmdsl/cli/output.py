@@ -1,0 +1,53 @@
+"""What the commands share: one JSON object, text safe for a terminal, a line of progress."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+Arguments = argparse.Namespace
+Run = Callable[[Arguments], int]
+Command = Callable[[str, Run, str], argparse.ArgumentParser]
+"""Adds a command: its name, what runs it, its help."""
+
+
+def as_json(sub: argparse.ArgumentParser) -> None:
+    """Add the option --json to a command."""
+    sub.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+
+
+def safe(text: str) -> str:
+    """Return text without control characters, for a terminal."""
+    return "".join(ch if ch.isprintable() else "\N{REPLACEMENT CHARACTER}" for ch in text)
+
+
+def print_json(data: Any, indent: int | None = None) -> None:
+    """Print strict JSON."""
+    print(json.dumps(data, allow_nan=False, indent=indent))
+
+
+class Progress:
+    """One line on stderr that overwrites itself, only on a terminal."""
+
+    def __init__(self) -> None:
+        self.shown, self.last, self.stage = sys.stderr.isatty(), 0.0, ""
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Show a stage and the fraction done (-1: unknown)."""
+        now = time.monotonic()
+        if not self.shown or (stage == self.stage and now - self.last < 0.1):
+            return
+        self.last, self.stage = now, stage
+        percent = f" {100 * fraction:3.0f} %" if fraction >= 0 else " ..."
+        print(f"\r\x1b[K{stage}{percent}", end="", file=sys.stderr, flush=True)
+
+    def __enter__(self) -> Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.shown and self.stage:
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)

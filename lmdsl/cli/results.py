@@ -1,0 +1,95 @@
+"""What is done with a result directory: ``verify``, ``simulate``, ``plot``, ``export``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json, safe
+
+
+def add(command: Command) -> None:
+    """Add the commands of this module."""
+    verify = command("verify", _verify, "Recompile a saved result and check every claim.")
+    verify.add_argument("dir", metavar="DIR", help="result directory")
+    verify.add_argument("--exact", action="store_true",
+                        help="judge in rational arithmetic, without tolerance")  # fmt: skip
+    as_json(verify)
+
+    simulate = command("simulate", _simulate, "Run the true map under a saved controller.")
+    simulate.add_argument("dir", metavar="DIR", help="result directory")
+    simulate.add_argument("--starts", type=int, default=10_000, metavar="N")
+    simulate.add_argument("--steps", type=int, default=10_000, metavar="T")
+    simulate.add_argument("--seed", type=int, default=0, metavar="S")
+    simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
+                          help="with a local controller, steps after reaching A")  # fmt: skip
+    as_json(simulate)
+
+    plot = command("plot", _plot, "Draw the figures of a saved result.")
+    plot.add_argument("dir", metavar="DIR", help="result directory")
+    plot.add_argument("--out", metavar="FILE", help="PNG, PDF or SVG (default DIR/figures.png)")
+
+    export = command("export", _export, "Write a saved result in a format for other readers.")
+    export.add_argument("dir", metavar="DIR", help="result directory")
+    export.add_argument("--format", required=True, choices=("certificate", "drn"),
+                        help="certificate: to be checked alone; drn: for Storm")  # fmt: skip
+    export.add_argument("--out", required=True, metavar="FILE", help="file to write")
+
+
+def _verify(parsed: Arguments) -> int:
+    from lmdsl.verification import verify
+
+    with Progress() as progress:
+        found = verify(parsed.dir, parsed.exact, progress)
+    parsed.status = 0 if found.holds else 1
+    if parsed.json:
+        print_json(found.to_dict())
+    else:
+        print(f"{found.status}: " + ("every claim holds" if found.holds else "NOT confirmed"))
+        gap = found.certificate.gap
+        if gap is not None:
+            print(f"  gap {gap:.2g}, tolerance {found.certificate.tolerance:.2g}")
+        for sentence in (*found.reasons, *found.notes):
+            print(f"  {safe(sentence)}")
+        print("  (claims speak of the finite model: cells and sampled transitions)")
+    return 0 if found.holds else 1
+
+
+def _simulate(parsed: Arguments) -> int:
+    from lmdsl.result import Result
+
+    result = Result.load(parsed.dir)
+    with Progress() as progress:
+        progress("simulate", -1.0)
+        runs = result.simulate(parsed.starts, parsed.steps, parsed.seed, parsed.hold)
+    if parsed.json:
+        print_json(runs.to_dict())
+        return 0
+    print(runs.text())
+    return 0
+
+
+def _plot(parsed: Arguments) -> int:
+    from lmdsl import plotting
+    from lmdsl.result import Result
+
+    result = Result.load(parsed.dir)
+    path = Path(parsed.out) if parsed.out is not None else Path(parsed.dir) / "figures.png"
+    plotting.figure(result, path)
+    print(f"written to {safe(str(path))}")
+    return 0
+
+
+def _export(parsed: Arguments) -> int:
+    from lmdsl.exports import export_certificate, export_drn
+    from lmdsl.result import Result
+    from lmdsl.verification import recompiled
+
+    result = Result.load(parsed.dir)
+    with Progress() as progress:
+        lp = recompiled(parsed.dir, result, progress)
+    if parsed.format == "drn":
+        export_drn(lp, parsed.out)
+    else:
+        export_certificate(result, parsed.out, lp)
+    print(f"written to {safe(parsed.out)}")
+    return 0

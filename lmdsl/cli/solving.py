@@ -1,0 +1,147 @@
+"""``solve`` and ``compare``."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json, safe
+
+
+def add(command: Command) -> None:
+    """Add the commands of this module."""
+    solve = command("solve", _solve, "Solve a problem and verify the answer.")
+    _problem_options(solve)
+    solve.add_argument("--backend", default="policy-iteration", metavar="B",
+                       help="backend, or backend:algorithm (see `lmdsl backends`)")  # fmt: skip
+    solve.add_argument("--max-iterations", type=int, metavar="K", help="iterations of the backend")
+    solve.add_argument("--require-all", action="store_true",
+                       help="refuse a problem with a cell that cannot be stabilized")  # fmt: skip
+    solve.add_argument("--restrict-to-gamma", action="store_true",
+                       help="solve on the cells for which gamma is feasible")  # fmt: skip
+    solve.add_argument("--out", metavar="DIR", help="write controller and certificate to DIR")
+    as_json(solve)
+
+    compare = command("compare", _compare, "Solve with several backends and compare.")
+    _problem_options(compare)
+    compare.add_argument("--backends", default="policy-iteration,highs,clarabel,cvxpy",
+                         metavar="A,B", help="comma-separated backends")  # fmt: skip
+    as_json(compare)
+
+
+def _problem_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("file", metavar="FILE", help="problem file")
+    sub.add_argument("--gamma", type=float, metavar="G", help="override gamma")
+    sub.add_argument("--tolerance", type=float, default=1e-6, metavar="T",
+                     help="largest gap that counts as verified (default 1e-6)")  # fmt: skip
+    sub.add_argument("--time-limit", type=float, metavar="S", help="seconds for the backend")
+
+
+def _problem(parsed: Arguments) -> Any:
+    from lmdsl.problem import load
+
+    problem = load(parsed.file)
+    return problem if parsed.gamma is None else problem.replaced(gamma=parsed.gamma)
+
+
+def _solve(parsed: Arguments) -> int:
+    if parsed.out is not None:
+        from lmdsl.archive import refuse_unless_free
+
+        refuse_unless_free(parsed.out)
+    problem = _problem(parsed)
+    from lmdsl.stabilize import solve
+
+    with Progress() as progress:
+        result = solve(
+            problem,
+            parsed.backend,
+            tolerance=parsed.tolerance,
+            time_limit=parsed.time_limit,
+            max_iterations=parsed.max_iterations,
+            require_all=parsed.require_all,
+            restrict_to_gamma=parsed.restrict_to_gamma,
+            progress=progress,
+        )
+    parsed.status = result.exit_status
+    if parsed.out is not None:
+        result.save(parsed.out)
+    if parsed.json:
+        print_json(result.to_dict())
+    else:
+        print(_summary(result))
+        if parsed.out is not None:
+            print(f"written to {safe(parsed.out)}")
+    return result.exit_status
+
+
+def _compare(parsed: Arguments) -> int:
+    problem = _problem(parsed)
+    from lmdsl.comparison import compare
+
+    names = [name.strip() for name in parsed.backends.split(",") if name.strip()]
+    with Progress() as progress:
+        comparison = compare(
+            problem,
+            names,
+            tolerance=parsed.tolerance,
+            time_limit=parsed.time_limit,
+            progress=progress,
+        )
+    parsed.status = comparison.exit_status
+    if parsed.json:
+        print_json(comparison.to_dict())
+    else:
+        print(comparison.table())
+    return comparison.exit_status
+
+
+def _summary(result: Any) -> str:
+    def number(value: float | None, digits: str = ".9g") -> str:
+        return "not established" if value is None else format(value, digits)
+
+    seconds = result.seconds
+    rows = [
+        ("problem", safe(result.problem.name) or "(no name)"),
+        ("status", result.status),
+        ("backend", f"{result.backend} ({result.solver_status or '-'})"),
+        ("cells", f"{result.cells} = {result.attractor_cells} attractor + "
+                  f"{result.stabilizable_cells} stabilizable + {_others(result)}"),
+        ("pairs", f"{result.pairs} surviving, {result.controls} controls"),
+        ("gamma", f"{result.gamma!r}"),
+    ]  # fmt: skip
+    if result.status != "not_stabilizable":
+        rows += [
+            ("cost", f"{number(result.cost)} (lower bound {number(result.lower_bound)})"),
+            ("gap", f"{number(result.gap, '.2g')} (tolerance {number(result.tolerance, '.2g')})"),
+            ("contraction", number(result.contraction)),
+            ("polish steps", str(result.polish_steps)),
+        ]
+    if result.local_controller:
+        rows.append(("local", result.local_controller.sentence()))
+    if result.gamma_bar:
+        rows.append(("gamma_bar", "{:.9g} to {:.9g}".format(*result.gamma_bar)))
+    stages = (("compile", seconds.compile), ("solve", seconds.solve), ("verify", seconds.verify))
+    spent = [f"{name} {value:.3f}" for name, value in stages if value is not None]
+    rows.append(("seconds", ", ".join(spent) or "-"))
+    width = max(len(name) for name, _ in rows)
+    lines = [f"{name.ljust(width)}  {value}" for name, value in rows]
+    return "\n".join([*lines, "", safe(result.message)])
+
+
+def _others(result: Any) -> str:
+    from lmdsl.graph import CellStatus
+
+    named = {
+        CellStatus.ESCAPES: "escaping",
+        CellStatus.TRAPPED: "trapped",
+        CellStatus.LEADS_TO_THESE: "leading to these",
+        CellStatus.AVOID: "avoid",
+        CellStatus.BEYOND_GAMMA: "beyond gamma",
+    }
+    parts = [
+        f"{count} {text}"
+        for code, text in named.items()
+        if (count := int((result.cell_status == code).sum()))
+    ]
+    return " + ".join(parts) or "0 others"

@@ -1,0 +1,257 @@
+"""A first stabilizing policy for a gamma, or a proof that there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl import bellman, bounds, linear
+from lmdsl.linear import Stop, Stopped, never
+from lmdsl.lp import StabilizationLP
+from lmdsl.policy import MOST_SWEEPS, iterate, stability_vector
+
+Floats = NDArray[np.float64]
+Pairs = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Feasible:
+    """A gamma-stabilizing policy, with its unit-cost value w = 1 + g P_u w."""
+
+    pair: Pairs
+    w: Floats
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A candidate proof that no policy is gamma-stabilizing: w >= 0, w <= gamma P_a w for all a.
+
+    ``pair`` is a policy that is stabilizing at ``lower`` < gamma.
+    """
+
+    w: Floats
+    pair: Pairs
+    lower: float
+
+
+@dataclass(frozen=True)
+class Undecided:
+    """gamma is so close to its limit that doubles decide neither way, or time ran out.
+
+    ``pair`` is a policy that is stabilizing at ``lower`` < gamma.
+    """
+
+    pair: Pairs
+    lower: float
+
+
+def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
+    """Sweep a guess of the unit-cost value until it proves a policy g-stabilizing, a while."""
+    w = w.copy()
+    lp.rows.system(pair, lp.growth, np.ones(lp.n)).sweep(w, MOST_SWEEPS, 0.0, 0.25)
+    return w if bounds.decrease(lp, pair, w, lp.growth) is not None else None
+
+
+def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused | Undecided:
+    """Find a policy that is stabilizing with weight g = max(gamma, 1), or a proof against it.
+
+    Candidates are the greedy policies of value iteration under unit cost from the levels of
+    Algorithm 1, which lie below it, then optimal policies under unit cost at gamma = 1 - 1/h, at
+    which no policy costs more than h. Where none does, gamma is raised in steps, each below the
+    limit of the last policy (unit cost, because under a cost with zeros this can stall).
+    """
+    reached: Feasible | Refused | Undecided = Undecided(lp.tree[1], 0.0)
+    try:
+        for reached in _raising(lp, stop):
+            if not isinstance(reached, Undecided):
+                break
+    except Stopped:
+        pass
+    return reached
+
+
+def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | Undecided]:
+    """Raise gamma step by step; yield what is known after each, the decision last."""
+    g, unit = lp.growth, np.ones(lp.K)
+    level, pair = lp.tree
+    V = level.astype(np.float64)
+    for k in range(4):
+        better = bellman.rise(lp, V, g, k % 2 == 1)
+        V = better.value
+        w = _proved(lp, better.pair, V) if k in (0, 3) else None
+        if w is not None:
+            yield Feasible(better.pair, w)
+            return
+    for horizon in (4.0 * level.max(), 64.0 * level.max()):
+        at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
+        for _ in range(4):
+            done = iterate(lp, pair, value, at, unit, stop=stop, limit=6)
+            pair, value = done.pair, done.value
+            w = _proved(lp, pair, value)
+            yield Undecided(pair, at) if w is None else Feasible(pair, w)
+            if stop():
+                return
+            if done.converged:
+                break
+    refuse_at = 0
+    for step in range(200):
+        done = iterate(lp, pair, value, at, unit, stop=stop)
+        pair, value = done.pair, done.value
+        yield Undecided(pair, at)
+        w, _ = stability_vector(lp, pair, stop=stop)
+        if w is not None:
+            yield Feasible(pair, w)
+            return
+        if stop():
+            return
+        if g > 1 and at >= 1 and step >= refuse_at:
+            refuse_at = 2 * step + 4
+            proof = refusal(lp, stop)
+            if proof is not None:
+                yield Refused(proof, pair, at)
+                return
+        # Raise gamma as far towards g as this policy allows, by bisection from above.
+        reach, raised = g, None
+        while raised is None and reach > at * (1 + 1e-13):
+            reach = at + (reach - at) / 2
+            raised, _ = stability_vector(lp, pair, g=reach, stop=stop)
+        if raised is None:
+            return
+        at, value = reach, raised
+        yield Undecided(pair, at)
+
+
+def refusal(lp: StabilizationLP, stop: Stop = never) -> Floats | None:
+    """Return w >= 0, w != 0 that should satisfy w <= gamma P_a w for every pair, or None.
+
+    w is the greatest solution of w = min(1, gamma' min_a P_a w) with gamma' just below gamma (the
+    slack absorbs rounding) or gamma itself. It is 0 exactly when gamma' < gamma_bar.
+    """
+    for slack in (1e-6, 1e-9, 1e-12, 0.0):
+        found = optimal_stopping(lp, lp.gamma * (1 - slack), np.ones(lp.n), stop=stop)
+        if found is None:
+            return None
+        if found.refuses:
+            return found.carried
+    return None
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """The outcome of optimal stopping.
+
+    Attributes
+    ----------
+    w
+        The greatest solution of w = min(reward, gamma min_a P_a w), shape (n,).
+    pair
+        A column for every cell; it counts where ``going``.
+    going
+        Cells that do not stop.
+    converged
+        False where rounding or the limit ended the work.
+    """
+
+    w: Floats
+    pair: Pairs
+    going: Bools
+    converged: bool
+
+    @property
+    def refuses(self) -> bool:
+        """True when w is not 0."""
+        return float(self.w.max(initial=0.0)) > 1e-9
+
+    @property
+    def carried(self) -> Floats:
+        """Return w without the cells at rounding level: their own rows then ask 0 <= something."""
+        return np.where(self.w > 1e-14 * self.w.max(initial=0.0), self.w, 0.0)
+
+
+def optimal_stopping(
+    lp: StabilizationLP,
+    gamma: float,
+    reward: Floats,
+    pair: Pairs | None = None,
+    going: Bools | None = None,
+    stop: Stop = never,
+    limit: int = 1000,
+) -> Stopping | None:
+    """Stop in a cell for ``reward``, or go on under the least favourable control, for ever.
+
+    Howard's policy iteration with "stop" as one more control, as :func:`iterate` makes it. Every
+    policy stays transient under gamma P, so a policy that ends with every cell going and w = 0
+    is gamma-stabilizing.
+
+    Parameters
+    ----------
+    lp, gamma
+        The model and the weight.
+    reward
+        Shape (n,), >= 0.
+    pair, going
+        A first policy, transient under gamma P on the cells that go; default: stop everywhere.
+    stop, limit
+        End the work, with None; largest number of steps.
+    """
+    pair = lp.pair_pointer[:-1].copy() if pair is None else pair
+    going = np.zeros(lp.n, dtype=np.bool_) if going is None else going
+    try:
+        return _stopping(lp, gamma, reward, pair, going, stop, limit)
+    except Stopped:
+        return None
+
+
+def _stopping(
+    lp: StabilizationLP,
+    gamma: float,
+    reward: Floats,
+    pair: Pairs,
+    going: Bools,
+    stop: Stop,
+    limit: int,
+) -> Stopping:
+    zero = np.zeros(lp.K)
+    w = _stopped(lp, gamma, reward, pair, going, stop)
+    if w is None:
+        going = np.zeros(lp.n, dtype=np.bool_)
+        w = reward
+    for step in range(limit):
+        if stop():
+            raise Stopped
+        lowered, new_pair, new_going = w, pair, going
+        for _ in range(step + 1):
+            better = bellman.improve(lp, lowered, gamma, zero)
+            least = np.minimum(better.value, reward)
+            same = np.where(better.value <= reward, new_going & (better.pair == new_pair), False)
+            change = (least < lowered * (1 - 1e-13)) & ~same
+            if not change.any():
+                break
+            lowered = np.where(change, least, lowered)
+            new_pair = np.where(change, better.pair, new_pair)
+            new_going = np.where(change, better.value <= reward, new_going)
+        if lowered is w:
+            return Stopping(np.minimum(w, reward), pair, going, True)
+        new = _stopped(lp, gamma, reward, new_pair, new_going, stop)
+        if new is None or not (new < w).any():
+            break  # rounding made a change look better than it is
+        w, pair, going = new, new_pair, new_going
+    return Stopping(np.minimum(w, reward), pair, going, False)
+
+
+def _stopped(
+    lp: StabilizationLP, gamma: float, reward: Floats, pair: Pairs, going: Bools, stop: Stop
+) -> Floats | None:
+    """Return what a stopping policy is paid: w = gamma P w where it goes, the reward elsewhere."""
+    w = reward.copy()
+    if going.any():
+        P = gamma * lp.rows.matrix(pair[going])
+        new = linear.solve(P[:, going], P[:, ~going] @ reward[~going], stop=stop)
+        if new is None:
+            return None
+        w[going] = new
+    return w
