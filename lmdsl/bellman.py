@@ -15,6 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import threads
+from lmdsl.linear import ONE
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -73,13 +74,13 @@ def improve(
         Other than the LP's own; ``cost`` has shape (K,).
     """
     value, pair = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
-    rows, x = lp.rows, padded(V)
+    x = padded(V)
     gamma = lp.gamma if gamma is None else gamma
     cost = lp.cost if cost is None else cost
 
     def part(cells: tuple[int, int]) -> None:
         _improve(
-            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            *cells, *lp.kernel,
             cost, gamma, x, value, pair,
         )  # fmt: skip
 
@@ -100,11 +101,11 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
         The order in which the cells of a range are visited.
     """
     value, pair = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
-    rows, x = lp.rows, padded(V)
+    x = padded(V)
 
     def part(cells: tuple[int, int]) -> None:
         _rise(
-            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            *cells, *lp.kernel,
             gamma, x, backwards, value, pair,
         )  # fmt: skip
 
@@ -115,11 +116,11 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
 def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDArray[np.bool_]:
     """Return the columns with Q <= Q_min + tolerance |Q_min|, shape (K,)."""
     ties = np.empty(lp.K, dtype=np.bool_)
-    rows, x, limit = lp.rows, padded(V), best + tolerance * np.abs(best)
+    x, limit = padded(V), best + tolerance * np.abs(best)
 
     def part(cells: tuple[int, int]) -> None:
         _tied(
-            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            *cells, *lp.kernel,
             lp.cost, lp.gamma, x, limit, ties,
         )  # fmt: skip
 
@@ -128,25 +129,29 @@ def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDAr
 
 
 @njit(cache=True, nogil=True)
-def _improve(first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, value, pair):  # type: ignore[no-untyped-def]
-    for i in range(first, last):
-        best, choice = np.inf, -1
-        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+def _improve(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, value, pair
+):
+    for i in range(np.uint64(first), np.uint64(last)):
+        best, choice = np.inf, pair_pointer[i]
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             q = 0.0
-            for e in range(pointer[k], pointer[k + 1]):
+            for e in range(pointer[k], pointer[k + ONE]):
                 q += share[code[e]] * V[target[e]]
             q = gamma * q + cost[k]
-            if q < best or choice < 0:
+            if q < best:
                 best, choice = q, k
         value[i], pair[i] = best, choice
 
 
 @njit(cache=True, nogil=True)
-def _tied(first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, limit, ties):  # type: ignore[no-untyped-def]
-    for i in range(first, last):
-        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+def _tied(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, limit, ties
+):
+    for i in range(np.uint64(first), np.uint64(last)):
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             q = 0.0
-            for e in range(pointer[k], pointer[k + 1]):
+            for e in range(pointer[k], pointer[k + ONE]):
                 q += share[code[e]] * V[target[e]]
             ties[k] = gamma * q + cost[k] <= limit[i]
 
@@ -155,21 +160,23 @@ def _tied(first, last, pair_pointer, pointer, target, code, share, cost, gamma, 
 def _rise(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, gamma, V, backwards, value, pair
 ):
+    first, last = np.uint64(first), np.uint64(last)
     for i in range(first, last):
         value[i] = V[i]
     for t in range(last - first):
-        i = last - 1 - t if backwards else first + t
+        i = last - ONE - t if backwards else first + t
         best, choice = np.inf, pair_pointer[i]
-        for k in range(pair_pointer[i], pair_pointer[i + 1]):
-            own, q = 0.0, 1.0
-            for e in range(pointer[k], pointer[k + 1]):
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
+            own, q = 0.0, 0.0
+            for e in range(pointer[k], pointer[k + ONE]):
                 j = target[e]
                 if j == i:
-                    own += gamma * share[code[e]]
+                    own += share[code[e]]
                 else:
-                    q += gamma * share[code[e]] * (value[j] if first <= j < last else V[j])
+                    q += share[code[e]] * (value[j] if first <= j < last else V[j])
+            own *= gamma
             if own < 1.0:
-                q /= 1.0 - own
+                q = (1.0 + gamma * q) / (1.0 - own)
                 if q < best:
                     best, choice = q, k
         value[i], pair[i] = max(best, value[i]), choice

@@ -18,6 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl.bellman import over_cells, padded
+from lmdsl.linear import ONE
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -25,6 +26,7 @@ Pairs = NDArray[np.int64]
 
 UNIT = 1.1 * 2.0**-53
 LEAST = 2.0**-1074
+MOST_EXACT_TERMS = 100_000
 MAX_EXACT = 20_000
 """Rows decided with exact rationals before giving up: about 0.4 s."""
 
@@ -32,8 +34,10 @@ MAX_EXACT = 20_000
 def expected_above(lp: StabilizationLP, pair: Pairs, x: Floats, gamma: float) -> Floats:
     """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
     upper = np.empty(lp.n)
-    rows = lp.rows
-    _above(pair, rows.pointer, rows.target, rows.code, rows.shares.value, gamma, padded(x), upper)
+    _above(
+        pair.view(np.uint64), *lp.rows.kernel, gamma, padded(x),
+        tame(lp, x, gamma), upper,
+    )  # fmt: skip
     return upper
 
 
@@ -56,12 +60,12 @@ def add_above(a: Floats, b: Floats) -> Floats:
 
 def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Floats:
     """Return a lower bound of min_a gamma P_a x + G_a, shape (n,); ``cost`` None means 0."""
-    lower, rows, V = np.empty(lp.n), lp.rows, padded(x)
+    lower, V = np.empty(lp.n), padded(x)
     cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
 
     def part(cells: tuple[int, int]) -> None:
         _below(
-            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            *cells, *lp.kernel,
             gamma, cost, V, plain, lower,
         )  # fmt: skip
 
@@ -79,13 +83,13 @@ def holds_for_all(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | N
 
 def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Pairs | None:
     """Return the pairs for which x <= gamma P_a x + G_a is not clear; None if too many."""
-    rows, V = lp.rows, padded(x)
+    V = padded(x)
     cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
 
     def part(cells: tuple[int, int]) -> tuple[int, Pairs]:
         found = np.empty(MAX_EXACT, dtype=np.int64)
         count = _open(
-            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            *cells, *lp.kernel,
             gamma, cost, V, plain, found,
         )  # fmt: skip
         return int(count), found[:count].copy()
@@ -167,7 +171,7 @@ def weighted(weight: Floats, values: Floats, direction: float) -> float:
     """Return weight'values rounded towards ``direction`` (an infinity), for values >= 0.
 
     Products are split exactly (Dekker) and summed exactly, so the result is the double nearest to
-    the exact sum on the side asked for.
+    the exact sum on the side asked for; sums of very many terms are bounded instead.
     """
     top = float(values.max(initial=0.0))
     if not np.isfinite(top) or top > 1e280:
@@ -175,6 +179,11 @@ def weighted(weight: Floats, values: Floats, direction: float) -> float:
             rough = total(weight * values)
         return rough * (1 + math.copysign(4 * UNIT, direction))
     product = weight * values
+    if len(product) > MOST_EXACT_TERMS:
+        # NumPy adds pairwise: fewer than 64 roundings deep, one more for each product.
+        near = float(product.sum())
+        slack = 70 * UNIT * near + len(product) * LEAST
+        return float(np.nextafter(near + math.copysign(slack, direction), direction))
     a, b = _halves(weight), _halves(values)
     error = ((a[0] * b[0] - product) + a[0] * b[1] + a[1] * b[0]) + a[1] * b[1]
     terms = [*product.tolist(), *error.tolist()]
@@ -210,17 +219,22 @@ def worst_excess(lp: StabilizationLP, V: Floats) -> tuple[float, bool]:
 
     r_a = max(0, V - lower bound of gamma P_a V - G_a), rounded up.
     """
-    rows, x, plain = lp.rows, padded(V), tame(lp, V, lp.gamma)
+    x, plain = padded(V), tame(lp, V, lp.gamma)
 
     def part(cells: tuple[int, int]) -> tuple[float, bool]:
         worst, stuck = _excess(
-            *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+            *cells, *lp.kernel,
             lp.gamma, lp.cost, x, plain,
         )  # fmt: skip
         return float(worst), bool(stuck)
 
     found = over_cells(lp, part)
     return max(worst for worst, _ in found), any(stuck for _, stuck in found)
+
+
+@njit(cache=True, nogil=True)
+def _relative(entries):  # type: ignore[no-untyped-def]
+    return (np.float64(entries) + 8.0) * UNIT
 
 
 @njit(cache=True, nogil=True)
@@ -231,14 +245,14 @@ def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def
     where every term is 0.
     """
     q, top = 0.0, 0.0
-    for e in range(pointer[k], pointer[k + 1]):
+    for e in range(pointer[k], pointer[k + ONE]):
         v = V[target[e]]
         if v != 0.0:
             top = max(top, v)
             q += share[code[e]] * v
-    entries = pointer[k + 1] - pointer[k]
-    absolute = entries * LEAST * (1.0 + top) if top > 0.0 else 0.0
-    return q, (entries + 8) * UNIT, absolute
+    entries = pointer[k + ONE] - pointer[k]
+    absolute = np.float64(entries) * LEAST * (1.0 + top) if top > 0.0 else 0.0
+    return q, _relative(entries), absolute
 
 
 @njit(cache=True, nogil=True)
@@ -246,9 +260,9 @@ def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: 
     """A lower bound of gamma (P V)_k + g; ``plain`` where no product underflows."""
     if plain:
         q = 0.0
-        for e in range(pointer[k], pointer[k + 1]):
+        for e in range(pointer[k], pointer[k + ONE]):
             q += share[code[e]] * V[target[e]]
-        relative = (pointer[k + 1] - pointer[k] + 8) * UNIT
+        relative = _relative(pointer[k + ONE] - pointer[k])
         return max((gamma * (q * (1.0 - relative)) + g) * (1.0 - 4.0 * UNIT), g)
     q, relative, absolute = _product(k, pointer, target, code, share, V)
     if absolute == 0.0:
@@ -258,9 +272,17 @@ def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def _above(pair, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
-    for i in range(len(pair)):
-        q, relative, absolute = _product(pair[i], pointer, target, code, share, V)
+def _above(pair, pointer, target, code, share, gamma, V, plain, upper):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(pair))):
+        k = pair[i]
+        if plain:
+            q = 0.0
+            for e in range(pointer[k], pointer[k + ONE]):
+                q += share[code[e]] * V[target[e]]
+            relative = _relative(pointer[k + ONE] - pointer[k])
+            upper[i] = gamma * (q * (1.0 + relative)) * (1.0 + 4.0 * UNIT)
+            continue
+        q, relative, absolute = _product(k, pointer, target, code, share, V)
         if absolute == 0.0:
             upper[i] = 0.0
         else:
@@ -272,9 +294,9 @@ def _above(pair, pointer, target, code, share, gamma, V, upper):  # type: ignore
 def _below(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain, lower
 ):
-    for i in range(first, last):
+    for i in range(np.uint64(first), np.uint64(last)):
         best = np.inf
-        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             g = cost[k] if len(cost) else 0.0
             q = _bound_below(k, pointer, target, code, share, gamma, g, V, plain)
             if q < best:
@@ -287,8 +309,8 @@ def _open(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain, found
 ):
     count = 0
-    for i in range(first, last):
-        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+    for i in range(np.uint64(first), np.uint64(last)):
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             g = cost[k] if len(cost) else 0.0
             if V[i] > _bound_below(k, pointer, target, code, share, gamma, g, V, plain):
                 if count < len(found):
@@ -302,8 +324,8 @@ def _excess(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain
 ):
     worst, stuck = 0.0, False
-    for i in range(first, last):
-        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+    for i in range(np.uint64(first), np.uint64(last)):
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             below = _bound_below(k, pointer, target, code, share, gamma, cost[k], V, plain)
             excess = V[i] - below
             if excess > 0.0:

@@ -13,12 +13,15 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+
+from lmdsl import threads
 
 Floats = NDArray[np.float64]
 
@@ -29,6 +32,8 @@ DENSE = 50
 TOLERANCE = 2e-15
 CEILING = 1e305
 NEVER = 1e308
+SPLIT = 100_000
+ONE = np.uint64(1)
 
 Stop = Callable[[], bool]
 
@@ -56,8 +61,8 @@ class System:
         Shape (n,), entries >= 0.
     """
 
-    indptr: NDArray[np.int64]
-    indices: NDArray[np.int32]
+    indptr: NDArray[np.uint64]
+    indices: NDArray[np.uint32]
     data: Floats
     inverse: Floats
     b: Floats
@@ -66,8 +71,8 @@ class System:
     def of(cls, M: Any, b: Floats) -> System:
         """Split a CSR array."""
         n, entries = len(b), len(M.data)
-        indptr = np.empty(n + 1, dtype=np.int64)
-        indices, data = np.empty(entries, dtype=np.int32), np.empty(entries)
+        indptr = np.empty(n + 1, dtype=np.uint64)
+        indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
         inverse = np.empty(n)
         _split(M.indptr, M.indices, M.data, indptr, indices, data, inverse)
         return cls(indptr, indices, data, inverse, b)
@@ -76,6 +81,8 @@ class System:
         self, x: Floats, count: int, enough: float = TOLERANCE, flat: float = 0.0
     ) -> tuple[float, float]:
         """Make Gauss-Seidel sweeps in place; see :func:`_gauss_seidel`."""
+        if len(x) >= SPLIT:  # by size alone: the result does not depend on the threads
+            return _in_halves(self, x, count, enough, flat)
         halfway, last = _gauss_seidel(
             self.indptr, self.indices, self.data, self.inverse, self.b, x, count, enough, flat
         )
@@ -247,8 +254,8 @@ def _dense(inner: Any) -> Callable[[Floats], Floats]:
 
 @njit(cache=True, nogil=True)
 def _split(indptr, indices, data, out_indptr, out_indices, out_data, inverse):  # type: ignore[no-untyped-def]
-    used = 0
-    out_indptr[0] = 0
+    used = np.uint64(0)
+    out_indptr[0] = used
     for i in range(len(inverse)):
         own = 0.0
         for e in range(indptr[i], indptr[i + 1]):
@@ -257,7 +264,7 @@ def _split(indptr, indices, data, out_indptr, out_indices, out_data, inverse):  
             else:
                 out_indices[used] = indices[e]
                 out_data[used] = data[e]
-                used += 1
+                used += ONE
         inverse[i] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
         out_indptr[i + 1] = used
 
@@ -271,37 +278,89 @@ def _gauss_seidel(indptr, indices, data, inverse, b, x, count, enough, flat):  #
     change of the sweep halfway and of the last one; ends early where that is at most ``enough``,
     where no component moved by more than ``flat``, or where x is no longer finite.
     """
-    n = len(b)
     halfway, change, top = np.inf, np.inf, 0.0
     for sweep in range(count):
         measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
-        if not measured:
-            for t in range(n):
-                i = t if sweep % 2 == 0 else n - 1 - t
-                y = b[i]
-                for e in range(indptr[i], indptr[i + 1]):
-                    y += data[e] * x[indices[e]]
-                x[i] = y * inverse[i]
-            continue
-        floor, top, change, most = 1e-14 * top + 1e-300, 0.0, 0.0, 0.0
-        for t in range(n):
-            i = t if sweep % 2 == 0 else n - 1 - t
-            y = b[i]
-            for e in range(indptr[i], indptr[i + 1]):
+        found = _sweep(
+            0, len(b), indptr, indices, data, inverse, b, x, x, sweep % 2 == 1, measured, top
+        )
+        if measured:
+            change, top = found[0], found[2]
+            if not top < CEILING:
+                return halfway, np.inf
+            if sweep == count // 2:
+                halfway = change
+            if change <= enough or found[1] <= flat:
+                break
+    return halfway, change
+
+
+@njit(cache=True, nogil=True)
+def _sweep(  # type: ignore[no-untyped-def]
+    first, last, indptr, indices, data, inverse, b, old, x, backwards, measured, top
+):
+    """Sweep over a range: ``x`` inside it, ``old`` outside; ``top`` was the largest component.
+
+    Returns the largest relative change, the largest absolute one, and the largest component.
+    """
+    floor, change, most, highest = 1e-14 * top + 1e-300, 0.0, 0.0, 0.0
+    first, last = np.uint64(first), np.uint64(last)
+    alone = first == np.uint64(0) and last == np.uint64(len(b))
+    for t in range(last - first):
+        i = last - ONE - t if backwards else first + t
+        y = b[i]
+        if alone:
+            for e in range(indptr[i], indptr[i + ONE]):
                 y += data[e] * x[indices[e]]
-            y *= inverse[i]
+        else:
+            for e in range(indptr[i], indptr[i + ONE]):
+                j = indices[e]
+                y += data[e] * (x[j] if first <= j < last else old[j])
+        y *= inverse[i]
+        if measured:
             moved = abs(y - x[i])
             if moved > change * max(y, floor):
                 change = moved / max(y, floor)
             most = max(most, moved)
-            top = max(top, y)
-            x[i] = y
-        if not top < CEILING:
-            return halfway, np.inf
-        if sweep == count // 2:
-            halfway = change
-        if change <= enough or most <= flat:
-            break
+            highest = max(highest, y)
+        x[i] = y
+    return change, most, highest
+
+
+def _in_halves(
+    system: System, x: Floats, count: int, enough: float, flat: float
+) -> tuple[float, float]:
+    """Make the same sweeps in two halves at a time, each with the other's last values."""
+    n = len(x)
+    halves = ((0, n // 2), (n // 2, n))
+    halfway, change, top = np.inf, np.inf, 0.0
+    now, then = x.copy(), x
+
+    def half(task: tuple[int, int, int, bool, float, Floats, Floats]) -> Any:
+        first, last, sweep, measured, highest, old, new = task
+        new[first:last] = old[first:last]
+        return _sweep(
+            first, last, system.indptr, system.indices, system.data, system.inverse, system.b,
+            old, new, sweep % 2 == 1, measured, highest,
+        )  # fmt: skip
+
+    with ThreadPoolExecutor(min(threads.count(), 2)) as pool:
+        for sweep in range(count):
+            measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
+            now, then = then, now
+            tasks = [(*ends, sweep, measured, top, now, then) for ends in halves]
+            found = list(pool.map(half, tasks))
+            if not measured:
+                continue
+            change, most, top = (max(part[k] for part in found) for k in range(3))
+            if not top < CEILING:
+                change = np.inf
+                break
+            if sweep == count // 2:
+                halfway = change
+            if change <= enough or most <= flat:
+                break
+    x[:] = then
     return halfway, change
 
 

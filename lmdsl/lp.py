@@ -171,6 +171,11 @@ class StabilizationLP:
         """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""
         return graph.tree(self.pair_pointer, self.rows)
 
+    @property
+    def kernel(self) -> tuple[NDArray[Any], ...]:
+        """The pairs of every cell and their rows as compiled loops read them."""
+        return self.pair_pointer.view(np.uint64), *self.rows.kernel
+
     @cached_property
     def predecessors(self) -> Predecessors:
         """Columns that can reach each cell."""

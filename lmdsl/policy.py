@@ -19,8 +19,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bellman, bounds, graph, linear
+from lmdsl.linear import ONE, Stopped, System, never
 from lmdsl.linear import Stop as Stop
-from lmdsl.linear import Stopped, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.screening import Pass, Screen
 
@@ -42,6 +42,7 @@ def evaluate(
     start: Floats | None = None,
     transient: bool = False,
     stop: Stop = never,
+    system: System | None = None,
 ) -> Floats | None:
     """Return V = G_u + gamma P_u V, shape (n,); None where the policy has no finite value.
 
@@ -57,6 +58,8 @@ def evaluate(
         The policy is known to be gamma-stabilizing, which saves looking whether it reaches A.
     stop
         Ends the work, with :class:`lmdsl.linear.Stopped`.
+    system
+        Its rows, where they are at hand.
     """
     gamma = lp.gamma if gamma is None else gamma
     b = (lp.cost if cost is None else cost)[pair]
@@ -65,7 +68,8 @@ def evaluate(
     if (b == 0).any():
         return linear.solve(gamma * lp.rows.matrix(pair), b, start, stop=stop)
     x = np.array(b if start is None else start, dtype=np.float64)
-    system = lp.rows.system(pair, gamma, b)
+    if system is None:
+        system = lp.rows.system(pair, gamma, b)
     return linear.solve_from(system, x, lambda: gamma * lp.rows.matrix(pair), stop=stop)
 
 
@@ -73,7 +77,7 @@ def reaches_attractor(lp: StabilizationLP, pair: Pairs) -> Bools:
     """Return the cells from which the policy can reach A, shape (n,)."""
     reaches = np.zeros(lp.n + 1, dtype=np.bool_)
     reaches[-1] = True
-    if not _reach(pair, lp.rows.pointer, lp.rows.target, reaches, 64):
+    if not _reach(pair.view(np.uint64), *lp.rows.kernel[:2], reaches, 64):
         level, _ = graph.tree(np.arange(lp.n + 1, dtype=np.int64), lp.rows.take(pair))
         return level >= 0
     return reaches[:-1]
@@ -82,14 +86,14 @@ def reaches_attractor(lp: StabilizationLP, pair: Pairs) -> Bools:
 @njit(cache=True, nogil=True)
 def _reach(pair, pointer, target, reaches, sweeps):  # type: ignore[no-untyped-def]
     """Mark cells with a marked successor until nothing changes; False where sweeps run out."""
-    n = len(pair)
+    n = np.uint64(len(pair))
     for sweep in range(sweeps):
         changed = False
         for t in range(n):
-            i = t if sweep % 2 == 0 else n - 1 - t
+            i = t if sweep % 2 == 0 else n - ONE - t
             if reaches[i]:
                 continue
-            for e in range(pointer[pair[i]], pointer[pair[i] + 1]):
+            for e in range(pointer[pair[i]], pointer[pair[i] + ONE]):
                 if reaches[target[e]]:
                     reaches[i] = changed = True
                     break
@@ -152,6 +156,7 @@ def iterate(
     """
     screen = Screen(lp, gamma, cost)
     gamma, cost = screen.gamma, screen.cost
+    system: System | None = None  # the rows of the policy at hand
     V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
     while True:
         out = stop() or step == limit
@@ -160,7 +165,8 @@ def iterate(
             x = done.value.copy()
             sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
             enough = 0.1 * _fall(V, x)
-            lp.rows.system(done.pair, gamma, cost[done.pair]).sweep(x, sweeps, enough)
+            system = lp.rows.system(done.pair, gamma, cost[done.pair])
+            system.sweep(x, sweeps, enough)
             x = np.minimum(x, done.value)
             screen.follow(V, x)
             pair, V = done.pair, x
@@ -169,7 +175,9 @@ def iterate(
         if last is not None and last[0] is pair:
             return Iteration(*last, step, not out, screen)
         try:
-            exact = evaluate(lp, pair, gamma, cost, done.value, transient=True, stop=stop)
+            exact = evaluate(
+                lp, pair, gamma, cost, done.value, transient=True, stop=stop, system=system
+            )
             if exact is None:
                 exact = evaluate(lp, pair, gamma, cost, stop=stop)
         except Stopped:
@@ -271,6 +279,7 @@ def stability_vector(
     g: float | None = None,
     sharp: bool = False,
     stop: Stop = never,
+    system: System | None = None,
 ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return w > 0, d > 0 with w >= g P_u w + d: a proof that the policy is g-stabilizing.
 
@@ -282,8 +291,10 @@ def stability_vector(
         return guess, d
     unit = np.ones(lp.n)
     w = unit.copy()
+    if system is None:
+        system = lp.rows.system(pair, g, unit)
     # Sweeps from below leave 1 + g P w - w at most what they still move.
-    if lp.rows.system(pair, g, unit).sweep(w, 128, 0.0, 1e-6 if sharp else 0.25)[1] < np.inf:
+    if system.sweep(w, 128, 0.0, 1e-2 if sharp else 0.25)[1] < np.inf:
         d = bounds.decrease(lp, pair, w, g)
         if d is not None:
             return w, d

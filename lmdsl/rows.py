@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lmdsl.linear import NEVER, System
+from lmdsl.linear import NEVER, ONE, System
 from lmdsl.sampling import Nodes
 
 
@@ -102,6 +102,15 @@ class Rows:
         """Number of rows."""
         return len(self.pointer) - 1
 
+    @property
+    def kernel(self) -> tuple[NDArray[Any], ...]:
+        """Pointer, target, code and shares as compiled loops read them.
+
+        Unsigned indices spare Numba the test for negative ones, which costs as much as the sum.
+        """
+        pointer, target = self.pointer.view(np.uint64), self.target.view(np.uint32)
+        return pointer, target, self.code, self.shares.value
+
     @cached_property
     def longest(self) -> int:
         """Largest number of entries of a row."""
@@ -125,12 +134,12 @@ class Rows:
     def system(self, rows: NDArray[np.int64], gamma: float, b: NDArray[np.float64]) -> System:
         """Return x = b + gamma P x for one row per column, ready for sweeps."""
         entries = int((self.pointer[rows + 1] - self.pointer[rows]).sum())
-        indptr = np.empty(len(rows) + 1, dtype=np.int64)
-        indices, data = np.empty(entries, dtype=np.int32), np.empty(entries)
+        indptr = np.empty(len(rows) + 1, dtype=np.uint64)
+        indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
         inverse = np.empty(len(rows))
         used = _gather_split(
-            rows, self.pointer, self.target, self.code, self.shares.value, self.columns, gamma,
-            indptr, indices, data, inverse,
+            rows.view(np.uint64), *self.kernel, np.uint32(self.columns), gamma, indptr, indices,
+            data, inverse,
         )  # fmt: skip
         return System(indptr, indices[:used], data[:used], inverse, b)
 
@@ -150,8 +159,7 @@ class Rows:
         indices = np.empty(int(pointer[-1]), dtype=indptr.dtype)
         data = np.empty(int(pointer[-1]))
         used = _gather(
-            chosen, self.pointer, self.target, self.code, self.shares.value, self.columns,
-            indptr, indices, data,
+            chosen.view(np.uint64), *self.kernel, np.uint32(self.columns), indptr, indices, data
         )  # fmt: skip
         matrix = csr_array((data[:used], indices[:used], indptr), shape=(len(chosen), self.columns))
         if not self.shares.merged:
@@ -160,39 +168,40 @@ class Rows:
 
 
 @njit(cache=True, nogil=True)
-def _gather(rows, pointer, target, code, share, columns, indptr, indices, data):  # type: ignore[no-untyped-def]
-    """Copy rows without the attractor's share into the arrays of a CSR matrix."""
-    used = 0
-    indptr[0] = 0
-    for r in range(len(rows)):
-        for e in range(pointer[rows[r]], pointer[rows[r] + 1]):
-            if target[e] < columns:
-                indices[used] = target[e]
-                data[used] = share[code[e]]
-                used += 1
-        indptr[r + 1] = used
-    return used
-
-
-@njit(cache=True, nogil=True)
 def _gather_split(  # type: ignore[no-untyped-def]
     rows, pointer, target, code, share, columns, gamma, indptr, indices, data, inverse
 ):
     """Copy rows without the attractor's share and without the diagonal, which is solved for."""
-    used = 0
-    indptr[0] = 0
-    for r in range(len(rows)):
-        own = 0.0
-        for e in range(pointer[rows[r]], pointer[rows[r] + 1]):
+    used = np.uint64(0)
+    indptr[0] = used
+    for r in range(np.uint64(len(rows))):
+        own, k = 0.0, rows[r]
+        for e in range(pointer[k], pointer[k + ONE]):
             j = target[e]
             if j == r:
                 own += gamma * share[code[e]]
             elif j < columns:
                 indices[used] = j
                 data[used] = gamma * share[code[e]]
-                used += 1
+                used += ONE
         inverse[r] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
-        indptr[r + 1] = used
+        indptr[r + ONE] = used
+    return used
+
+
+@njit(cache=True, nogil=True)
+def _gather(rows, pointer, target, code, share, columns, indptr, indices, data):  # type: ignore[no-untyped-def]
+    """Copy rows without the attractor's share into the arrays of a CSR matrix."""
+    used = np.uint64(0)
+    indptr[0] = 0
+    for r in range(np.uint64(len(rows))):
+        k = rows[r]
+        for e in range(pointer[k], pointer[k + ONE]):
+            if target[e] < columns:
+                indices[used] = target[e]
+                data[used] = share[code[e]]
+                used += ONE
+        indptr[r + ONE] = used
     return used
 
 

@@ -17,6 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bellman
+from lmdsl.linear import ONE
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -82,15 +83,16 @@ class Screen:
         margin
             Q < Q_u - margin |Q_u| counts as better.
         """
-        lp, rows = self.lp, self.lp.rows
+        lp = self.lp
         value, new = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
         x, backwards = bellman.padded(V), self.passes % 2 == 1
         self.passes += 1
+        own = pair.view(np.uint64)
 
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(
-                *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
-                self.cost, self.gamma, x, pair, margin, self.scale,
+                *cells, *lp.kernel,
+                self.cost, self.gamma, x, own, margin, self.scale,
                 backwards, self.least, self.rival, value, new,
             )  # fmt: skip
             return int(changed), int(looked)
@@ -100,12 +102,12 @@ class Screen:
 
     def tied(self, V: Floats, tolerance: float) -> NDArray[np.bool_]:
         """Return the columns with Q <= Q_min + tolerance |Q_min| at V, shape (K,)."""
-        lp, rows = self.lp, self.lp.rows
+        lp = self.lp
         x, ties = bellman.padded(V), np.zeros(lp.K, dtype=np.bool_)
 
         def part(cells: tuple[int, int]) -> None:
             _ties(
-                *cells, lp.pair_pointer, rows.pointer, rows.target, rows.code, rows.shares.value,
+                *cells, *lp.kernel,
                 self.cost, self.gamma, x, tolerance, self.scale, self.least, ties,
             )  # fmt: skip
 
@@ -127,7 +129,7 @@ class Screen:
 def _expected(k, first, last, pointer, target, code, share, V, value):  # type: ignore[no-untyped-def]
     """(P V)_k with the new values of the range of cells at hand."""
     q = 0.0
-    for e in range(pointer[k], pointer[k + 1]):
+    for e in range(pointer[k], pointer[k + ONE]):
         j = target[e]
         q += share[code[e]] * (value[j] if first <= j < last else V[j])
     return q
@@ -144,18 +146,19 @@ def _pass(  # type: ignore[no-untyped-def]
     computed only where some rival remains. ``rival`` is the smallest bound of a cell's rivals.
     """
     changed, looked = 0, 0
+    first, last = np.uint64(first), np.uint64(last)
     store = (1.0 - 1e-6) / scale
     for i in range(first, last):
         value[i] = V[i]
     for t in range(last - first):
-        i = last - 1 - t if backwards else first + t
+        i = last - ONE - t if backwards else first + t
         own = pair[i]
         new[i] = own
         limit = V[i] / scale
         if rival[i] >= limit:
             continue
         own_q, best, choice = np.inf, np.inf, own
-        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             if k == own or least[k] >= limit:
                 continue
             if own_q == np.inf:
@@ -178,7 +181,7 @@ def _pass(  # type: ignore[no-untyped-def]
             new[i] = choice
         value[i] = min(value[i], best if new[i] != own else own_q)
         smallest = np.float32(3e38)
-        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             if k != new[i]:
                 smallest = min(smallest, least[k])
         rival[i] = smallest
@@ -191,19 +194,20 @@ def _ties(  # type: ignore[no-untyped-def]
     least, ties,
 ):  # fmt: skip
     """Mark the tied columns of a range of cells: first Q_min, then all that come near."""
-    choices = 0
+    choices = np.uint64(0)
+    first, last = np.uint64(first), np.uint64(last)
     for i in range(first, last):
-        choices = max(choices, pair_pointer[i + 1] - pair_pointer[i])
+        choices = max(choices, pair_pointer[i + ONE] - pair_pointer[i])
     q = np.empty(choices)
     for i in range(first, last):
-        begin, end = pair_pointer[i], pair_pointer[i + 1]
+        begin, end = pair_pointer[i], pair_pointer[i + ONE]
         best = np.inf
         for k in range(begin, end):
             if least[k] * scale > best * (1.0 + tolerance):
                 q[k - begin] = np.inf
                 continue
             q_k = 0.0
-            for e in range(pointer[k], pointer[k + 1]):
+            for e in range(pointer[k], pointer[k + ONE]):
                 q_k += share[code[e]] * V[target[e]]
             q_k = gamma * q_k + cost[k]
             q[k - begin] = q_k

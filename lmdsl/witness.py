@@ -5,6 +5,7 @@ Nothing here is trusted: certificate.check judges what comes out.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -41,8 +42,10 @@ def certify(
     value, w
         Guesses of the policy's value and its unit-cost value; made where missing.
     """
-    w, d = policy.stability_vector(lp, pair, w, sharp=True)
-    V = policy.evaluate(lp, pair, start=value, transient=w is not None)
+    rows = lp.rows.system(pair, lp.gamma, lp.cost[pair])
+    unit = replace(rows, b=np.ones(lp.n)) if lp.growth == lp.gamma else None
+    w, d = policy.stability_vector(lp, pair, w, sharp=True, system=unit)
+    V = policy.evaluate(lp, pair, start=value, transient=w is not None, system=rows)
     if V is None:
         witness = Witness(pair, w, None, lower_vector(lp, None, tolerance), None)
         return Verified(check(lp, witness, tolerance), witness)
@@ -85,22 +88,22 @@ def upper_vector(
     lp: StabilizationLP, pair: Pairs, V: Floats, w: Floats | None, d: Floats | None
 ) -> Floats | None:
     """Return V_up = V + delta w with delta >= max(residual / d), None where it fails."""
-    if check_upper(lp, pair, V):
-        return V
-    if w is None or d is None:
-        if lp.gamma >= 1:
-            return None
+    if not np.isfinite(V).all() or not (V >= 0).all():
+        return None
+    if (w is None or d is None) and lp.gamma < 1:
         w, d = np.ones(lp.n), np.full(lp.n, (1 - lp.gamma) * 0.99)
     for _ in range(4):
         future = bounds.expected_above(lp, pair, V, lp.gamma)
         residual = bounds.add_above(future, lp.cost[pair]) - V
+        if (residual <= 0).all():
+            return V
+        if w is None or d is None:
+            return None
         delta = max(float((residual / d).max()), 0.0) * 1.01
         V = V + delta * w
         if not np.isfinite(V).all():
             return None
-        if check_upper(lp, pair, V):
-            return V
-    return None
+    return V if check_upper(lp, pair, V) else None
 
 
 def lower_vector(lp: StabilizationLP, V: Floats | None, tolerance: float) -> Floats:
@@ -137,4 +140,4 @@ def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
 
 def _measure_vector(lp: StabilizationLP, pair: Pairs) -> Floats | None:
     inflow: Any = lp.gamma * lp.rows.matrix(pair).T.tocsr()
-    return linear.solve(inflow, lp.weight, enough=1e-13)
+    return linear.solve(inflow, lp.weight, enough=1e-12)
