@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lmdsl import memory, sampling, threads
 from lmdsl.errors import BadInput
-from lmdsl.merging import LANES, merge
+from lmdsl.merging import merge, tile
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.regions import Regions
@@ -184,7 +184,8 @@ class _Assembler:
         end = np.empty(lanes, dtype=np.int64)
         target = np.empty(index.size, dtype=np.int32)
         code = np.empty(index.size, dtype=np.uint32)
-        key = np.empty((sampler.samples, LANES), dtype=self.key)
+        high, wide = tile(block.cells_last, block.width)
+        key = np.empty((sampler.samples, high * wide), dtype=self.key)
         pairs, entries = merge(
             index, block.cells_last, mean, self.number, self.group, self.bits, self.first_code,
             key, per_cell, control, cost, end, target, code,
