@@ -215,11 +215,11 @@ def restrict(
     renumber = np.full(rows.columns + 1, -1, dtype=np.int32)
     renumber[np.flatnonzero(found.inside)] = np.arange(n, dtype=np.int32)
     renumber[rows.columns] = n
-    length = np.diff(rows.pointer)
-    entry = np.repeat(found.surviving, length)
-    pointer = np.concatenate([[0], np.cumsum(length[kept])]).astype(np.int64)
-    smaller = Rows(pointer, renumber[rows.target[entry]], rows.code[entry], rows.shares, n)
-    return kept, pair_pointer, smaller
+    pointer = np.zeros(len(kept) + 1, dtype=np.int64)
+    entries = _ends(found.surviving, rows.pointer, pointer)
+    target, code = np.empty(entries, dtype=np.int32), np.empty(entries, dtype=rows.code.dtype)
+    _keep(found.surviving, rows.pointer, rows.target, rows.code, renumber, target, code)
+    return kept, pair_pointer, Rows(pointer, target, code, rows.shares, n)
 
 
 def owner(pair_pointer: NDArray[np.int64]) -> NDArray[np.int32]:
@@ -322,3 +322,25 @@ def _remove(lost, pointer, pair, cell, pair_pointer, alive, inside, choices):  #
                     inside[i] = False
                     queue[end] = i
                     end += 1
+
+
+@njit(cache=True, nogil=True)
+def _ends(kept, pointer, ends):  # type: ignore[no-untyped-def]
+    """Write the ends of the rows that are kept, one after the other; return the last."""
+    row = end = 0
+    for k in range(len(kept)):
+        if kept[k]:
+            row, end = row + 1, end + pointer[k + 1] - pointer[k]
+            ends[row] = end
+    return end
+
+
+@njit(cache=True, nogil=True)
+def _keep(kept, pointer, target, code, renumber, new_target, new_code):  # type: ignore[no-untyped-def]
+    """Copy the rows that are kept, their targets renumbered."""
+    at = 0
+    for k in range(len(kept)):
+        if kept[k]:
+            for e in range(pointer[k], pointer[k + 1]):
+                new_target[at], new_code[at] = renumber[target[e]], code[e]
+                at += 1

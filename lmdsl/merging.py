@@ -9,9 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
-LANES = 64
-"""Pairs sorted at a time: their keys stay in the first-level cache."""
-
 
 @njit(cache=True, nogil=True)
 def merge(  # type: ignore[no-untyped-def]
@@ -34,7 +31,8 @@ def merge(  # type: ignore[no-untyped-def]
     first_code
         Code of one sample of each group; n samples have ``first_code + n - 1``.
     key
-        Room of shape (S, LANES) for ``target << bits | group``, wide enough for it.
+        Room for ``target << bits | group`` of the samples of a tile of pairs (:func:`tile`), shape
+        (cells, S, controls) of the tile as (S, cells * controls), wide enough for it.
     per_cell, control, cost, end, target, code
         Results. Admissible pairs of each cell (zeros on entry); for each of them, ordered by cell,
         then control, its control, mean cost and the end of its row; the rows one after the other.
@@ -45,37 +43,60 @@ def merge(  # type: ignore[no-untyped-def]
         How many were written.
     """
     pairs = entries = 0
-    cells, lanes = len(per_cell), index.shape[0] * index.shape[2]
-    i, j = np.empty((2, LANES), dtype=np.int64)  # the pairs at hand: first and last index
-    a = c = 0
-    for first in range(0, lanes, LANES):
-        count = min(LANES, lanes - first)
-        for k in range(count):
-            i[k], j[k] = (a, c) if cells_last else (c, a)
-            a += 1
-            if a == lanes // cells:
-                a, c = 0, c + 1
-        _keys(index, i, j, count, number, group, bits, key)
-        _sort(key, count)
-        for k in range(count):
-            if key[0, k] >= 0:  # a sample that leaves has a negative key, which comes first
-                entries = _row(key, k, bits, first_code, entries, target, code)
-                per_cell[j[k] if cells_last else i[k]] += 1
-                control[pairs] = i[k] if cells_last else j[k]
-                cost[pairs] = mean[min(i[k], mean.shape[0] - 1), min(j[k], mean.shape[1] - 1)]
-                end[pairs] = entries
-                pairs += 1
+    cells = len(per_cell)
+    controls = index.shape[0] * index.shape[2] // cells
+    high, wide = tile(cells_last, controls)
+    for c0 in range(0, cells, high):
+        for a0 in range(0, controls, wide):
+            c1, a1 = min(c0 + high, cells), min(a0 + wide, controls)
+            _keys(index, cells_last, c0, c1, a0, a1, number, group, bits, key)
+            _sort(key, (c1 - c0) * (a1 - a0))
+            k = 0
+            for c in range(c0, c1):
+                for a in range(a0, a1):
+                    if key[0, k] >= 0:  # a sample that leaves has a negative key, now the first
+                        entries = _row(key, k, bits, first_code, entries, target, code)
+                        i, j = (a, c) if cells_last else (c, a)
+                        cost[pairs] = mean[min(i, len(mean) - 1), min(j, mean.shape[1] - 1)]
+                        control[pairs], end[pairs] = a, entries
+                        per_cell[c] += 1
+                        pairs += 1
+                    k += 1
     return pairs, entries
 
 
 @njit(cache=True, nogil=True)
-def _keys(index, i, j, count, number, group, bits, key):  # type: ignore[no-untyped-def]
-    """Gather ``target << bits | group`` of every sample of some pairs."""
-    for s in range(len(key)):
-        for k in range(count):
-            x = index[i[k], s, j[k]]
-            t = number[np.uint64(x)] if x >= 0.0 else -1
-            key[s, k] = (t << bits) | group[s]
+def tile(cells_last, controls):  # type: ignore[no-untyped-def]
+    """Return how many cells and controls are sorted at a time.
+
+    Their keys stay in the first-level cache, and images are read by the cache line.
+    """
+    return (8, controls) if cells_last else (1, 64)
+
+
+@njit(cache=True, nogil=True)
+def _keys(index, cells_last, c0, c1, a0, a1, number, group, bits, key):  # type: ignore[no-untyped-def]
+    """Gather ``target << bits | group`` of every sample of a tile, columns by cell and control.
+
+    All samples of a pair one after the other: they land near each other, in ``number`` too.
+    """
+    wide = a1 - a0
+    if cells_last:
+        for a in range(a0, a1):
+            for s in range(len(key)):
+                _gather(index[a, s, c0:c1], number, group[s], bits, key[s, a - a0 :: wide])
+    else:
+        for c in range(c0, c1):
+            for s in range(len(key)):
+                _gather(index[c, s, a0:a1], number, group[s], bits, key[s, (c - c0) * wide :])
+
+
+@njit(cache=True, nogil=True)
+def _gather(line, number, group, bits, key):  # type: ignore[no-untyped-def]
+    for i in range(len(line)):
+        inside = line[i] >= 0.0
+        t = number[np.uint64(np.int64(line[i] if inside else 0.0))]  # unsigned: not from the end
+        key[i] = ((t if inside else -1) << bits) | group
 
 
 @njit(cache=True, nogil=True)

@@ -107,18 +107,18 @@ class Program:
         tuple of ndarray
             One new array per formula, in the broadcast shape of the names it uses.
         """
-        missing = ", ".join(sorted(self.names.difference(values)))
-        if missing:
+        if not self.names <= values.keys():
+            missing = ", ".join(sorted(self.names.difference(values)))
             raise BadInput(f"no value is given for {missing}; give one for every name")
         slots: list[Any] = list(self._template)
         for name, slot in self._variables.items():
             slots[slot] = np.asarray(values[name], dtype=np.float64)
         with np.errstate(all="ignore"):
-            for step in self._instructions:
-                operands = [slots[k] for k in step.operands]
-                room = _room(operands, [slots[k] for k in step.reusable])
-                slots[step.target] = OPERATIONS[step.operation](*operands, **room)
-                for k in step.released:
+            for operation, places, target, released, reusable in self._instructions:
+                operands = [slots[k] for k in places]
+                room = _room(operands, [slots[k] for k in reusable]) if reusable else {}
+                slots[target] = OPERATIONS[operation](*operands, **room)
+                for k in released:
                     slots[k] = None
         aliases = set(self._variables.values())
         results: list[NDArray[np.float64]] = []

@@ -31,21 +31,34 @@ def count() -> int:
 def in_order(work: Callable[[Part], Outcome], parts: Iterable[Part]) -> Iterator[Outcome]:
     """Yield ``work(part)`` for every part, in order, computed ahead by a few parts.
 
-    The first part that raises ends the iteration with its error; the parts begun are waited for,
-    the others never begin.
+    The calling thread works too. The first part that raises ends the iteration with its error;
+    the parts begun are waited for, the others never begin.
     """
-    workers = count()
-    if workers == 1:
+    helpers = count() - 1
+    if not helpers:
         yield from map(work, parts)
         return
-    pool = ThreadPoolExecutor(workers)
+    pool = ThreadPoolExecutor(helpers)
     ahead: deque[Future[Outcome]] = deque()
     try:
         for part in parts:
-            ahead.append(pool.submit(work, part))
-            if len(ahead) > 2 * workers:
+            if sum(not future.done() for future in ahead) < 2 * helpers:
+                ahead.append(pool.submit(work, part))
+            else:
+                ahead.append(_done(work, part))
+            while ahead and (ahead[0].done() or len(ahead) > 8 * helpers):
                 yield ahead.popleft().result()
         while ahead:
             yield ahead.popleft().result()
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _done(work: Callable[[Part], Outcome], part: Part) -> Future[Outcome]:
+    """Do the work now; an error waits for its turn."""
+    future: Future[Outcome] = Future()
+    try:
+        future.set_result(work(part))
+    except Exception as error:
+        future.set_exception(error)
+    return future

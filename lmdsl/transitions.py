@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lmdsl import memory, sampling, threads
 from lmdsl.errors import BadInput
-from lmdsl.merging import LANES, merge
+from lmdsl.merging import merge, tile
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.regions import Regions
@@ -57,20 +57,32 @@ class Transitions:
     cost: Floats
 
 
-def estimate(problem: Problem, entries: float = 1.0) -> int:
-    """Return the bytes needed to compile a problem, given the mean entries per row."""
+class Pilot(NamedTuple):
+    """What a few cells say of all: the share of admissible pairs and the mean length of rows."""
+
+    admissible: float = 1.0
+    entries: float = 1.0
+
+
+ALL_ADMISSIBLE = Pilot()
+
+
+def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
+    """Return the bytes that compiling a problem takes at its peak."""
     # Capped: a stranger's product of counts may exceed the range of doubles.
     N = min(math.prod(axis.cells for axis in problem.state_box.values()), 10**40)
     M = min(sampling.control_count(problem), 10**40)
     S = min(sampling.sample_points(problem) * sampling.node_count(problem), 10**40)
     code = 1 if S <= 2**8 else 2 if S <= 2**16 else 4
-    pairs = N * M
-    rows = pairs * (20 + entries * (4 + code) * 1.25)
-    graph = pairs * (8 + 4 * entries)
+    # Of a pair the row's end, control, cost and whether it survives; of a cell the regions,
+    # levels and weights.
+    per_pair = 21 + pilot.entries * (4 + code)
+    if pilot.admissible < 1:  # cells may be lost: the model is copied without them
+        per_pair += 28 + pilot.entries * (4 + code)
     grids = M * 8 * (1 + len(problem.control_grid)) + S * (8 * len(problem.state_box) + 200)
     # Samples and images of every axis, and the intermediate arrays of a formula.
-    temporaries = (2 * len(problem.state_box) + 10) * 8 * max(CHUNK, S)
-    return int(min(N * 40 + rows + graph + grids + temporaries, 1e30))
+    temporaries = (2 * len(problem.state_box) + 10) * 8 * max(CHUNK, S) * threads.count()
+    return int(min(N * (64 + M * pilot.admissible * per_pair) + grids + temporaries, 1e30))
 
 
 def assemble(
@@ -87,13 +99,14 @@ def assemble(
     memory.require(estimate(problem), "a lower estimate, before sampling")
     regions = Regions.of(problem, partition)
     sampler = Sampler(problem, partition)
-    mean_entries = _pilot(sampler, regions)
-    memory.require(estimate(problem, mean_entries), "estimated from a few cells")
+    pilot = _pilot(sampler, regions)
+    memory.require(estimate(problem, pilot), "estimated from a few cells")
     F, M = len(regions.free), len(sampler.controls)
     shares = Shares.of(len(sampler.points), sampler.nodes)
-    room = int(F * M * mean_entries * 1.05) + sampler.samples
-    pointer, control = _Growing(np.int64, F * M + 1), _Growing(np.int32, F * M)
-    cost = _Growing(np.float64, F * M)
+    pairs = int(F * M * min(1.0, 1.05 * pilot.admissible)) + M
+    room = int(pairs * 1.05 * pilot.entries) + sampler.samples
+    pointer, control = _Growing(np.int64, pairs + 1), _Growing(np.int32, pairs)
+    cost = _Growing(np.float64, pairs)
     target, code = _Growing(np.int32, room), _Growing(code_type(len(shares.numerator)), room)
     pair_pointer = np.zeros(F + 1, dtype=np.int64)
     pointer.append(np.zeros(1, dtype=np.int64))
@@ -171,7 +184,8 @@ class _Assembler:
         end = np.empty(lanes, dtype=np.int64)
         target = np.empty(index.size, dtype=np.int32)
         code = np.empty(index.size, dtype=np.uint32)
-        key = np.empty((sampler.samples, LANES), dtype=self.key)
+        high, wide = tile(block.cells_last, block.width)
+        key = np.empty((sampler.samples, high * wide), dtype=self.key)
         pairs, entries = merge(
             index, block.cells_last, mean, self.number, self.group, self.bits, self.first_code,
             key, per_cell, control, cost, end, target, code,
@@ -188,18 +202,32 @@ class _Assembler:
         )
 
 
-def _pilot(sampler: Sampler, regions: Regions) -> float:
-    """Estimate the mean entries per pair from a few cells spread over the box."""
+def _pilot(sampler: Sampler, regions: Regions) -> Pilot:
+    """Sample a few cells spread over the box."""
     if not len(regions.free):
-        return 1.0
-    M, S = len(sampler.controls), sampler.samples
-    count = max(1, min(32, CHUNK // (M * S), len(regions.free)))
-    cells = regions.free[np.linspace(0, len(regions.free) - 1, count).astype(int)]
-    block = Block(0, cells, (0, min(M, max(1, 4 * CHUNK // S))))
-    rows = np.sort(sampler.images(block, sampler.values(block)), axis=1)
-    kept = np.isfinite(rows).all(axis=1)
-    distinct = (np.diff(rows, axis=1) != 0).sum(axis=1) + 1
-    return float(distinct[kept].mean()) if kept.any() else 1.0
+        return Pilot()
+    F, M, S = len(regions.free), len(sampler.controls), sampler.samples
+    count = min(64, F)
+    cells = regions.free[np.linspace(0, F - 1, count).astype(int)]
+    width = max(1, min(M, 4 * CHUNK // (count * S)))
+    blocks = [Block(0, cells, (0, M))]
+    if width < M:  # another part of the controls for every cell
+        starts = np.linspace(0, M - width, count).astype(int).tolist()
+        blocks = [Block(0, cells[i : i + 1], (a, a + width)) for i, a in enumerate(starts)]
+    lengths = np.concatenate([_lengths(sampler, regions, block) for block in blocks])
+    kept = lengths > 0
+    return Pilot(float(kept.mean()), float(lengths[kept].mean()) if kept.any() else 1.0)
+
+
+def _lengths(sampler: Sampler, regions: Regions, block: Block) -> NDArray[np.int64]:
+    """Return the number of targets of every pair of a block, 0 where inadmissible."""
+    index = sampler.images(block, sampler.values(block))
+    leaves = np.isnan(index)
+    target = regions.number[np.where(leaves, 0.0, index).astype(np.int64)]
+    target[leaves] = -1
+    rows = np.sort(target, axis=1)
+    lengths: NDArray[np.int64] = (np.diff(rows, axis=1) != 0).sum(axis=1) + 1
+    return np.where(rows[:, 0] >= 0, lengths, 0).ravel()
 
 
 def _refuse_cost(sampler: Sampler, cell: int, control: int) -> None:

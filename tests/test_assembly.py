@@ -9,7 +9,7 @@ from problems import made, standard_map
 
 import lmdsl as lm
 from lmdsl import merging, sampler, threads
-from lmdsl.merging import LANES, mean_cost, merge
+from lmdsl.merging import mean_cost, merge, tile
 from lmdsl.partition import EDGE, Partition
 
 
@@ -65,7 +65,7 @@ def test_indices_broadcast_and_one_axis_outside_is_outside():
 @pytest.mark.parametrize("kind", [np.int32, np.int64])
 def test_rows_count_the_samples_of_each_target_and_group(samples, cells_last, groups, kind):
     rng = np.random.default_rng(samples)
-    cells, controls, N = 41, 7, 12
+    (cells, controls), N = (41, 7) if cells_last else (3, 150), 12
     index = rng.integers(0, N, (cells, controls, samples)).astype(float)
     index[rng.random(index.shape) < 0.3 / samples] = np.nan
     number = rng.integers(0, 5, N).astype(np.int32)
@@ -81,7 +81,7 @@ def test_rows_count_the_samples_of_each_target_and_group(samples, cells_last, gr
     code = np.empty(pairs * samples, dtype=np.uint32)
     kept, entries = merge(
         np.ascontiguousarray(laid[0]), cells_last, np.ascontiguousarray(laid[1]), number, group,
-        bits, first_code, np.empty((samples, LANES), dtype=kind),
+        bits, first_code, np.empty((samples, math.prod(tile(cells_last, controls))), dtype=kind),
         per_cell, control, cost, end, target, code,
     )  # fmt: skip
     expected = []
@@ -106,9 +106,9 @@ def test_rows_count_the_samples_of_each_target_and_group(samples, cells_last, gr
 
 @pytest.mark.parametrize("length", [1, 2, 5, 16, 33, 100])
 def test_the_network_sorts(length):
-    key = np.random.default_rng(length).integers(-3, 9, (length, LANES)).astype(np.int32)
+    key = np.random.default_rng(length).integers(-3, 9, (length, 40)).astype(np.int32)
     expected = np.sort(key, axis=0)
-    merging._sort(key, LANES)
+    merging._sort(key, 40)
     assert (key == expected).all()
 
 
