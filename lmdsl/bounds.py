@@ -256,19 +256,24 @@ def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: ignore[no-untyped-def]
-    """A lower bound of gamma (P V)_k + g; ``plain`` where no product underflows."""
-    if plain:
-        q = 0.0
-        for e in range(pointer[k], pointer[k + ONE]):
-            q += share[code[e]] * V[target[e]]
-        relative = _relative(pointer[k + ONE] - pointer[k])
-        return max((gamma * (q * (1.0 - relative)) + g) * (1.0 - 4.0 * UNIT), g)
+def _careful(k, pointer, target, code, share, gamma, g, V):  # type: ignore[no-untyped-def]
+    """A lower bound of gamma (P V)_k + g that minds underflow."""
     q, relative, absolute = _product(k, pointer, target, code, share, V)
     if absolute == 0.0:
         return g
     future = gamma * max(q * (1.0 - relative) - absolute, 0.0)
     return max((future + g) * (1.0 - 4.0 * UNIT) - 2.0 * LEAST, g)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: ignore[no-untyped-def]
+    """A lower bound of gamma (P V)_k + g; ``plain`` where no product underflows."""
+    q = 0.0
+    for e in range(pointer[k], pointer[k + ONE]):
+        q += share[code[e]] * V[target[e]]
+    relative = (np.float64(pointer[k + ONE] - pointer[k]) + 8.0) * UNIT
+    below = max((gamma * (q * (1.0 - relative)) + g) * (1.0 - 4.0 * UNIT), g)
+    return below if plain else _careful(k, pointer, target, code, share, gamma, g, V)
 
 
 @njit(cache=True, nogil=True)
