@@ -53,15 +53,16 @@ class System:
 
     Attributes
     ----------
-    indptr, indices, data
-        The rows of M without its diagonal.
+    begin, end, indices, data
+        The rows of M without its diagonal: row i is ``begin[i]:end[i]``.
     inverse
         1 / (1 - M_ii), huge where M_ii >= 1: no finite x_i > 0 satisfies such a row.
     b
         Shape (n,), entries >= 0.
     """
 
-    indptr: NDArray[np.uint64]
+    begin: NDArray[np.uint64]
+    end: NDArray[np.uint64]
     indices: NDArray[np.uint32]
     data: Floats
     inverse: Floats
@@ -71,11 +72,12 @@ class System:
     def of(cls, M: Any, b: Floats) -> System:
         """Split a CSR array."""
         n, entries = len(b), len(M.data)
-        indptr = np.empty(n + 1, dtype=np.uint64)
+        end = np.empty(n, dtype=np.uint64)
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
         inverse = np.empty(n)
-        _split(M.indptr, M.indices, M.data, indptr, indices, data, inverse)
-        return cls(indptr, indices, data, inverse, b)
+        begin = M.indptr[:-1].astype(np.uint64)
+        _split(M.indptr, M.indices, M.data, end, indices, data, inverse)
+        return cls(begin, end, indices, data, inverse, b)
 
     def sweep(
         self, x: Floats, count: int, enough: float = TOLERANCE, flat: float = 0.0
@@ -84,8 +86,9 @@ class System:
         if len(x) >= SPLIT:  # by size alone: the result does not depend on the threads
             return _in_halves(self, x, count, enough, flat)
         halfway, last = _gauss_seidel(
-            self.indptr, self.indices, self.data, self.inverse, self.b, x, count, enough, flat
-        )
+            self.begin, self.end, self.indices, self.data, self.inverse, self.b, x, count, enough,
+            flat,
+        )  # fmt: skip
         return float(halfway), float(last)
 
 
@@ -253,24 +256,22 @@ def _dense(inner: Any) -> Callable[[Floats], Floats]:
 
 
 @njit(cache=True, nogil=True)
-def _split(indptr, indices, data, out_indptr, out_indices, out_data, inverse):  # type: ignore[no-untyped-def]
-    used = np.uint64(0)
-    out_indptr[0] = used
+def _split(indptr, indices, data, end, out_indices, out_data, inverse):  # type: ignore[no-untyped-def]
     for i in range(len(inverse)):
-        own = 0.0
+        own, used = 0.0, indptr[i]
         for e in range(indptr[i], indptr[i + 1]):
             if indices[e] == i:
                 own += data[e]
             else:
                 out_indices[used] = indices[e]
                 out_data[used] = data[e]
-                used += ONE
+                used += 1
         inverse[i] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
-        out_indptr[i + 1] = used
+        end[i] = used
 
 
 @njit(cache=True, nogil=True)
-def _gauss_seidel(indptr, indices, data, inverse, b, x, count, enough, flat):  # type: ignore[no-untyped-def]
+def _gauss_seidel(begin, end, indices, data, inverse, b, x, count, enough, flat):  # type: ignore[no-untyped-def]
     """Sweep over the components, forwards and backwards in turn, using each as soon as known.
 
     Staying put is summed up at once, so a chain of slow cells takes one sweep in its direction.
@@ -282,7 +283,7 @@ def _gauss_seidel(indptr, indices, data, inverse, b, x, count, enough, flat):  #
     for sweep in range(count):
         measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
         found = _sweep(
-            0, len(b), indptr, indices, data, inverse, b, x, x, sweep % 2 == 1, measured, top
+            0, len(b), begin, end, indices, data, inverse, b, x, x, sweep % 2 == 1, measured, top
         )
         if measured:
             change, top = found[0], found[2]
@@ -297,7 +298,7 @@ def _gauss_seidel(indptr, indices, data, inverse, b, x, count, enough, flat):  #
 
 @njit(cache=True, nogil=True)
 def _sweep(  # type: ignore[no-untyped-def]
-    first, last, indptr, indices, data, inverse, b, old, x, backwards, measured, top
+    first, last, begin, end, indices, data, inverse, b, old, x, backwards, measured, top
 ):
     """Sweep over a range: ``x`` inside it, ``old`` outside; ``top`` was the largest component.
 
@@ -310,10 +311,10 @@ def _sweep(  # type: ignore[no-untyped-def]
         i = last - ONE - t if backwards else first + t
         y = b[i]
         if alone:
-            for e in range(indptr[i], indptr[i + ONE]):
+            for e in range(begin[i], end[i]):
                 y += data[e] * x[indices[e]]
         else:
-            for e in range(indptr[i], indptr[i + ONE]):
+            for e in range(begin[i], end[i]):
                 j = indices[e]
                 y += data[e] * (x[j] if first <= j < last else old[j])
         y *= inverse[i]
@@ -340,8 +341,8 @@ def _in_halves(
         first, last, sweep, measured, highest, old, new = task
         new[first:last] = old[first:last]
         return _sweep(
-            first, last, system.indptr, system.indices, system.data, system.inverse, system.b,
-            old, new, sweep % 2 == 1, measured, highest,
+            first, last, system.begin, system.end, system.indices, system.data, system.inverse,
+            system.b, old, new, sweep % 2 == 1, measured, highest,
         )  # fmt: skip
 
     with ThreadPoolExecutor(min(threads.count(), 2)) as pool:

@@ -1,13 +1,12 @@
-"""Policies of the finite model: evaluate, improve, break ties, and find a first stabilizing one.
+"""Policies of the finite model: evaluate, improve, break ties.
 
 A policy is an array of columns, one per cell of C (``pair``). P_u, G_u are its rows. It is
 *gamma-stabilizing* when the spectral radius of gamma P_u is below 1; then its value
 V = G_u + gamma P_u V is finite. Write g = max(gamma, 1).
 
-For gamma >= 1, Howard's policy iteration from a gamma-stabilizing policy that changes a control
-only where strictly better keeps every policy gamma-stabilizing, zeros in the cost included: on a
-recurrent class of a bad new policy, V >= gamma P V + G forces equality everywhere, so nothing
-there was changed.
+For gamma >= 1, policy iteration from a gamma-stabilizing policy u and V >= T_u V that changes a
+control only where strictly better keeps every policy gamma-stabilizing, zeros in the cost included
+(docs/mathematics.md, Policy iteration).
 """
 
 from __future__ import annotations

@@ -11,17 +11,20 @@ entry, 0 there. Every row sums to exactly 1 with it.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lmdsl.linear import NEVER, ONE, System
+from lmdsl import threads
+from lmdsl.linear import NEVER, ONE, SPLIT, System
 from lmdsl.sampling import Nodes
 
 
@@ -133,15 +136,28 @@ class Rows:
 
     def system(self, rows: NDArray[np.int64], gamma: float, b: NDArray[np.float64]) -> System:
         """Return x = b + gamma P x for one row per column, ready for sweeps."""
-        entries = int((self.pointer[rows + 1] - self.pointer[rows]).sum())
-        indptr = np.empty(len(rows) + 1, dtype=np.uint64)
+        count = len(rows)
+        chosen, columns = rows.view(np.uint64), np.uint32(self.columns)
+        begin, end = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
+        inverse = np.empty(count)
+        parts = 8 if count >= SPLIT else 1
+        edges = np.linspace(0, count, parts + 1).astype(np.int64).tolist()
+
+        def lengths(cells: tuple[int, int]) -> None:
+            _lengths(*cells, chosen, self.kernel[0], end)
+
+        def fill(cells: tuple[int, int]) -> None:
+            _gather_split(
+                *cells, chosen, *self.kernel, columns, gamma, begin, end, indices, data, inverse
+            )
+
+        deque(threads.in_order(lengths, pairwise(edges)), maxlen=0)
+        begin[:1] = 0
+        np.cumsum(end[:-1], out=begin[1:])
+        entries = int(begin[-1] + end[-1]) if count else 0
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
-        inverse = np.empty(len(rows))
-        used = _gather_split(
-            rows.view(np.uint64), *self.kernel, np.uint32(self.columns), gamma, indptr, indices,
-            data, inverse,
-        )  # fmt: skip
-        return System(indptr, indices[:used], data[:used], inverse, b)
+        deque(threads.in_order(fill, pairwise(edges)), maxlen=0)
+        return System(begin, end, indices, data, inverse, b)
 
     def matrix(self, rows: NDArray[np.integer] | None = None):  # type: ignore[no-untyped-def]
         """Return rows as a SciPy CSR array of doubles, shape (len(rows), columns).
@@ -168,14 +184,19 @@ class Rows:
 
 
 @njit(cache=True, nogil=True)
+def _lengths(first, last, rows, pointer, length):  # type: ignore[no-untyped-def]
+    for r in range(np.uint64(first), np.uint64(last)):
+        length[r] = pointer[rows[r] + ONE] - pointer[rows[r]]
+
+
+@njit(cache=True, nogil=True)
 def _gather_split(  # type: ignore[no-untyped-def]
-    rows, pointer, target, code, share, columns, gamma, indptr, indices, data, inverse
-):
+    first, last, rows, pointer, target, code, share, columns, gamma, begin, end, indices, data,
+    inverse,
+):  # fmt: skip
     """Copy rows without the attractor's share and without the diagonal, which is solved for."""
-    used = np.uint64(0)
-    indptr[0] = used
-    for r in range(np.uint64(len(rows))):
-        own, k = 0.0, rows[r]
+    for r in range(np.uint64(first), np.uint64(last)):
+        own, k, used = 0.0, rows[r], begin[r]
         for e in range(pointer[k], pointer[k + ONE]):
             j = target[e]
             if j == r:
@@ -185,8 +206,7 @@ def _gather_split(  # type: ignore[no-untyped-def]
                 data[used] = gamma * share[code[e]]
                 used += ONE
         inverse[r] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
-        indptr[r + ONE] = used
-    return used
+        end[r] = used
 
 
 @njit(cache=True, nogil=True)

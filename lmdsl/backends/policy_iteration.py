@@ -1,8 +1,8 @@
-"""Our own backend: Howard's policy iteration on the compact rows.
+"""Our own backend: policy iteration on the compact rows.
 
-From a g-stabilizing start each step evaluates the policy and changes a control only where strictly
-better. The values fall and the last policy is optimal, for every gamma and with zeros in the cost;
-for gamma >= 1 every policy on the way is gamma-stabilizing (see policy.py).
+From a g-stabilizing start each step changes a control only where strictly better, and evaluates the
+policy as far as the step was worth. The values fall and the last policy is optimal, for every gamma
+and with zeros in the cost; for gamma >= 1 every policy on the way is gamma-stabilizing (policy.py).
 """
 
 from __future__ import annotations
