@@ -29,8 +29,10 @@ def compact(lp: lm.StabilizationLP) -> list[NDArray[Any]]:
 
 
 def cold(lp: lm.StabilizationLP) -> lm.StabilizationLP:
-    """Return the same LP without anything it remembers."""
-    return replace(lp, rows=replace(lp.rows))
+    """Return the same LP without anything it remembers but what compiling hands over."""
+    fresh = replace(lp, rows=replace(lp.rows))
+    vars(fresh)["tree"] = lp.tree
+    return fresh
 
 
 def improvement_sweep(lp: lm.StabilizationLP, V: NDArray[Any]) -> Callable[[], Any]:

@@ -74,19 +74,20 @@ class LocalCheck:
 def check(problem: Problem, local: LocalController) -> LocalCheck:
     """Check whether the local controller of a problem keeps the attractor cells."""
     cells = np.flatnonzero(local.attractor)
+    samples = int(min(SAMPLES, max(1e7 // len(noise_nodes(problem).values), 100)))
     return LocalCheck(
         kind="constant" if problem.local_controller is None else problem.local_controller.kind,
         multiplier=local.multiplier,
         cells=len(cells),
         proved=_proved(problem, local, cells),
-        samples=SAMPLES,
-        kept=_sampled(problem, local, cells),
+        samples=samples,
+        kept=_sampled(problem, local, cells, samples),
     )
 
 
-def _sampled(problem: Problem, local: LocalController, cells: Indices) -> int:
+def _sampled(problem: Problem, local: LocalController, cells: Indices, count: int) -> int:
     rng = np.random.default_rng(0)
-    cell = cells[rng.integers(len(cells), size=SAMPLES)]
+    cell = cells[rng.integers(len(cells), size=count)]
     partition = local.partition
     index = np.stack(partition.multi_index(cell), axis=-1)
     x = partition.low + (index + rng.random(index.shape)) * partition.width
