@@ -31,8 +31,8 @@ def merge(  # type: ignore[no-untyped-def]
     first_code
         Code of one sample of each group; n samples have ``first_code + n - 1``.
     key
-        Room for ``target << bits | group`` of the samples of a tile of pairs (:func:`tile`), shape
-        (cells, S, controls) of the tile as (S, cells * controls), wide enough for it.
+        Room for ``target << bits | group`` of the samples of a tile, an integer type wide enough
+        for it, shape (S, cells * controls) with the numbers of :func:`tile`.
     per_cell, control, cost, end, target, code
         Results. Admissible pairs of each cell (zeros on entry); for each of them, ordered by cell,
         then control, its control, mean cost and the end of its row; the rows one after the other.
@@ -71,7 +71,7 @@ def tile(cells_last, controls):  # type: ignore[no-untyped-def]
 
     Their keys stay in the first-level cache, and images are read by the cache line.
     """
-    return (8, controls) if cells_last else (1, 64)
+    return (8, controls) if cells_last else (1, min(64, controls))
 
 
 @njit(cache=True, nogil=True)
