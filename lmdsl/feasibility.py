@@ -76,7 +76,7 @@ def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused |
 
 def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | Undecided]:
     """Raise gamma step by step; yield what is known after each, the decision last."""
-    g, unit = lp.growth, np.ones(lp.K)
+    g = lp.growth
     level, pair = lp.tree
     V = level.astype(np.float64)
     for k in range(4):
@@ -86,6 +86,7 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
         if w is not None:
             yield Feasible(better.pair, w)
             return
+    unit = np.ones(lp.K)
     for horizon in (4.0 * level.max(), 64.0 * level.max()):
         at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
         for _ in range(4):

@@ -97,6 +97,7 @@ def solve(
     b: Floats,
     start: Floats | None = None,
     enough: float = TOLERANCE,
+    flat: float = 0.0,
     stop: Stop = never,
 ) -> Floats | None:
     """Return x >= 0 with x = b + M x, or None where there is none (as far as rounding can tell).
@@ -109,8 +110,8 @@ def solve(
         Shape (n,), entries >= 0.
     start
         A guess, shape (n,), >= 0.
-    enough
-        Relative change of a sweep that ends the work.
+    enough, flat
+        Relative, and absolute, change of a sweep that ends the work.
     stop
         Asked after the first few sweeps, then again and again between sweeps and classes.
 
@@ -122,7 +123,7 @@ def solve(
     x = np.array(b if start is None else start, dtype=np.float64)
     if (b == 0).any():
         x[~_pays(M, b)] = 0.0  # exactly: a guess would only fade there
-    return solve_from(System.of(M, b), x, lambda: M, enough, stop)
+    return solve_from(System.of(M, b), x, lambda: M, enough, flat, stop)
 
 
 def solve_from(
@@ -130,10 +131,11 @@ def solve_from(
     x: Floats,
     matrix: Callable[[], Any],
     enough: float = TOLERANCE,
+    flat: float = 0.0,
     stop: Stop = never,
 ) -> Floats | None:
     """Solve from a guess, which is overwritten; ``matrix`` makes M where sweeps are slow."""
-    change, rate = _trial(system, x, enough)
+    change, rate = _trial(system, x, enough, flat)
     if change <= enough:
         return x
     if not _soon(change, rate):
@@ -143,7 +145,7 @@ def solve_from(
     for _ in range(MAX_SWEEPS // TRIAL_SWEEPS):
         if stop():
             raise Stopped
-        change, rate = _trial(system, x, enough)
+        change, rate = _trial(system, x, enough, flat)
         if change <= enough:
             return x
         if not np.isfinite(change) or x.max() > CEILING:
@@ -166,9 +168,9 @@ def _soon(change: float, rate: float) -> bool:
     return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < 300)
 
 
-def _trial(system: System, x: Floats, enough: float) -> tuple[float, float]:
+def _trial(system: System, x: Floats, enough: float, flat: float) -> tuple[float, float]:
     """Sweep; return the last relative change, and the factor by which a sweep shrinks it."""
-    halfway, last = system.sweep(x, TRIAL_SWEEPS, enough)
+    halfway, last = system.sweep(x, TRIAL_SWEEPS, enough, flat)
     rate = (last / halfway) ** (2 / TRIAL_SWEEPS) if 0 < halfway < np.inf else 0.0
     return last, rate
 
@@ -277,7 +279,8 @@ def _gauss_seidel(begin, end, indices, data, inverse, b, x, count, enough, flat)
     Staying put is summed up at once, so a chain of slow cells takes one sweep in its direction.
     From x >= b + M x every sweep lowers x, from below it raises it. Returns the largest relative
     change of the sweep halfway and of the last one; ends early where that is at most ``enough``,
-    where no component moved by more than ``flat``, or where x is no longer finite.
+    where no component moved by more than ``flat`` (and calls the change 0), or where x is no longer
+    finite.
     """
     halfway, change, top = np.inf, np.inf, 0.0
     for sweep in range(count):
@@ -291,8 +294,10 @@ def _gauss_seidel(begin, end, indices, data, inverse, b, x, count, enough, flat)
                 return halfway, np.inf
             if sweep == count // 2:
                 halfway = change
-            if change <= enough or found[1] <= flat:
+            if change <= enough:
                 break
+            if found[1] <= flat:
+                return halfway, 0.0
     return halfway, change
 
 
@@ -359,7 +364,10 @@ def _in_halves(
                 break
             if sweep == count // 2:
                 halfway = change
-            if change <= enough or most <= flat:
+            if change <= enough:
+                break
+            if most <= flat:
+                change = 0.0
                 break
     x[:] = then
     return halfway, change

@@ -227,11 +227,8 @@ def canonical(
     """
     if screen is None:
         screen = Screen(lp)
-    ties = screen.tied(value, TIE)
-    ties[pair] = True
-    choices = np.add.reduceat(ties, lp.pair_pointer[:-1], dtype=np.int64)
-    first = first_column(lp, ties)
-    if (choices == 1).all():
+    ties, first, several = screen.tied(value, TIE, pair)
+    if not several:
         return first
     found = graph.stabilizable(*_columns(lp, ties))
     if not found.inside.any():

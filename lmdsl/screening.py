@@ -100,19 +100,30 @@ class Screen:
         counts = bellman.over_cells(lp, part)
         return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
 
-    def tied(self, V: Floats, tolerance: float) -> NDArray[np.bool_]:
-        """Return the columns with Q <= Q_min + tolerance |Q_min| at V, shape (K,)."""
+    def tied(
+        self, V: Floats, tolerance: float, pair: Pairs
+    ) -> tuple[NDArray[np.bool_], Pairs, bool]:
+        """Find the columns with Q <= Q_min + tolerance |Q_min| at V, and those of a policy.
+
+        Returns
+        -------
+        ties : shape (K,)
+        first : shape (n,), the first tied column of every cell
+        several : whether a cell has more than one
+        """
         lp = self.lp
-        x, ties = bellman.padded(V), np.zeros(lp.K, dtype=np.bool_)
+        x, ties = bellman.padded(V), np.empty(lp.K, dtype=np.bool_)
+        first, own = np.empty(lp.n, dtype=np.int64), pair.view(np.uint64)
 
-        def part(cells: tuple[int, int]) -> None:
-            _ties(
+        def part(cells: tuple[int, int]) -> bool:
+            several = _ties(
                 *cells, *lp.kernel,
-                self.cost, self.gamma, x, tolerance, self.scale, self.least, ties,
+                self.cost, self.gamma, x, tolerance, self.scale, self.least, own,
+                ties, first,
             )  # fmt: skip
+            return bool(several)
 
-        bellman.over_cells(lp, part)
-        return ties
+        return ties, first, any(bellman.over_cells(lp, part))
 
     def follow(self, before: Floats, after: Floats) -> None:
         """Note that V fell from ``before`` to ``after``."""
@@ -191,9 +202,10 @@ def _pass(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _ties(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, tolerance, scale,
-    least, ties,
+    least, pair, ties, chosen,
 ):  # fmt: skip
     """Mark the tied columns of a range of cells: first Q_min, then all that come near."""
+    several = False
     choices = np.uint64(0)
     first, last = np.uint64(first), np.uint64(last)
     for i in range(first, last):
@@ -212,5 +224,12 @@ def _ties(  # type: ignore[no-untyped-def]
             q_k = gamma * q_k + cost[k]
             q[k - begin] = q_k
             best = min(best, q_k)
+        count, chosen[i] = 0, -1
         for k in range(begin, end):
-            ties[k] = q[k - begin] <= best + tolerance * abs(best)
+            ties[k] = q[k - begin] <= best + tolerance * abs(best) or k == pair[i]
+            if ties[k]:
+                count += 1
+                if chosen[i] < 0:
+                    chosen[i] = k
+        several |= count > 1
+    return several

@@ -12,7 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import bounds, linear, policy
-from lmdsl.certificate import Verified, Witness, check, check_lower, check_upper, gap, weighted
+from lmdsl.certificate import (
+    MEASURE_TOLERANCE,
+    Verified,
+    Witness,
+    check,
+    check_lower,
+    check_measure,
+    check_upper,
+    gap,
+    weighted,
+)
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -140,7 +150,8 @@ def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
 
 def _measure_vector(lp: StabilizationLP, pair: Pairs) -> Floats | None:
     inflow: Any = lp.gamma * lp.rows.matrix(pair).T.tocsr()
-    mu = linear.solve(inflow, lp.weight, enough=1e-12)
-    if mu is not None and mu.sum() > 100:  # the residual must be small in absolute terms
+    # The residual counts in absolute terms, summed over all cells.
+    mu = linear.solve(inflow, lp.weight, flat=1e-2 * MEASURE_TOLERANCE / lp.n)
+    if mu is not None and check_measure(lp, pair, mu) > MEASURE_TOLERANCE:
         mu = linear.solve(inflow, lp.weight, start=mu)
     return mu
