@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 T = TypeVar("T")
 
-GRAIN = 200_000
+GRAIN = 500_000
 """Transitions that are worth a thread."""
 
 
@@ -52,7 +52,7 @@ def over_cells(lp: StabilizationLP, part: Callable[[tuple[int, int]], T]) -> lis
 
     The ranges, and so the results, do not depend on the number of threads.
     """
-    count = max(1, min(len(lp.rows.target) // GRAIN, 64, lp.n))
+    count = max(1, min(len(lp.rows.target) // GRAIN, 16, lp.n))
     ends = np.linspace(0, lp.n, count + 1).astype(np.int64).tolist()
     ranges = list(pairwise(ends))
     return [part(ranges[0])] if count == 1 else list(threads.in_order(part, ranges))

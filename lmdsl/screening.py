@@ -137,16 +137,6 @@ class Screen:
 
 
 @njit(cache=True, nogil=True)
-def _expected(k, first, last, pointer, target, code, share, V, value):  # type: ignore[no-untyped-def]
-    """(P V)_k with the new values of the range of cells at hand."""
-    q = 0.0
-    for e in range(pointer[k], pointer[k + ONE]):
-        j = target[e]
-        q += share[code[e]] * (value[j] if first <= j < last else V[j])
-    return q
-
-
-@njit(cache=True, nogil=True)
 def _pass(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, pair, margin, scale,
     backwards, least, rival, value, new,
@@ -158,44 +148,51 @@ def _pass(  # type: ignore[no-untyped-def]
     """
     changed, looked = 0, 0
     first, last = np.uint64(first), np.uint64(last)
-    store = (1.0 - 1e-6) / scale
-    for i in range(first, last):
-        value[i] = V[i]
+    x = V.copy()  # other ranges keep the values from before the pass
+    store, shrink = (1.0 - 1e-6) / scale, 1.0 / scale
     for t in range(last - first):
         i = last - ONE - t if backwards else first + t
         own = pair[i]
         new[i] = own
-        limit = V[i] / scale
+        limit = x[i] * shrink
         if rival[i] >= limit:
             continue
         own_q, best, choice = np.inf, np.inf, own
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
-            if k == own or least[k] >= limit:
+            if least[k] >= limit or k == own:
                 continue
             if own_q == np.inf:
-                own_q = _expected(own, first, last, pointer, target, code, share, V, value)
+                own_q = 0.0
+                for e in range(pointer[own], pointer[own + ONE]):
+                    own_q += share[code[e]] * x[target[e]]
                 own_q = gamma * own_q + cost[own]
                 looked += 1
                 least[own] = min(own_q * store, 3e38)
                 best = own_q
-                limit = min(limit, own_q / scale)
+                limit = min(limit, own_q * shrink)
                 if least[k] >= limit:
                     continue
-            q = _expected(k, first, last, pointer, target, code, share, V, value)
+            q = 0.0
+            for e in range(pointer[k], pointer[k + ONE]):
+                q += share[code[e]] * x[target[e]]
             q = gamma * q + cost[k]
             looked += 1
             least[k] = min(q * store, 3e38)
             if q < best:
-                best, choice, limit = q, k, q / scale
+                best, choice, limit = q, k, q * shrink
         if choice != own and best < own_q - margin * abs(own_q):
             changed += 1
             new[i] = choice
-        value[i] = min(value[i], best if new[i] != own else own_q)
+        else:
+            best = own_q
+        x[i] = min(x[i], best)
         smallest = np.float32(3e38)
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             if k != new[i]:
                 smallest = min(smallest, least[k])
         rival[i] = smallest
+    for i in range(first, last):
+        value[i] = x[i]
     return changed, looked
 
 
