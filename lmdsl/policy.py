@@ -30,7 +30,7 @@ Bools = NDArray[np.bool_]
 TIE = 1e-12
 """Relative difference in Q up to which two controls count as tied."""
 
-LEAST_SWEEPS, MOST_SWEEPS = 4, 60
+LEAST_SWEEPS, MOST_SWEEPS = 12, 60
 
 
 def evaluate(
