@@ -42,9 +42,9 @@ def improvement_sweep(lp: lm.StabilizationLP, V: NDArray[Any]) -> Callable[[], A
 
 def evaluation_sweep(lp: lm.StabilizationLP, pair: NDArray[Any]) -> Callable[[], Any]:
     """Return one evaluation sweep over the rows of a policy."""
-    system = lp.rows.system(pair, lp.gamma, lp.cost[pair])
-    x = system.b.copy()
-    return lambda: system.sweep(x, 1)
+    system, b = lp.rows.system(pair, lp.gamma), lp.cost[pair]
+    x = b.copy()
+    return lambda: system.sweep(b, x, 1)
 
 
 def evaluation(lp: lm.StabilizationLP, pair: NDArray[Any]) -> Callable[[], Any]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lmdsl import bellman, bounds, linear
 from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP
-from lmdsl.policy import MOST_SWEEPS, iterate, stability_vector
+from lmdsl.policy import MOST_SWEEPS, iterate, peeled, stability_vector
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
@@ -52,7 +52,7 @@ class Undecided:
 def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
     """Sweep a guess of the unit-cost value until it proves a policy g-stabilizing, a while."""
     w = w.copy()
-    lp.rows.system(pair, lp.growth, np.ones(lp.n)).sweep(w, MOST_SWEEPS, 0.0, 0.25)
+    linear.advance(peeled(lp, pair, lp.growth), np.ones(lp.n), w, MOST_SWEEPS, 0.0, 0.25)
     return w if bounds.decrease(lp, pair, w, lp.growth) is not None else None
 
 

@@ -1,7 +1,8 @@
 """Solving x = b + M x for a nonnegative sparse M: the evaluation of a fixed policy.
 
 For b >= 0 the smallest nonnegative solution is sum M^k b, finite for every b exactly when the
-spectral radius of M is below 1. Gauss-Seidel sweeps converge to it, from any x >= 0, at least as
+spectral radius of M is below 1. The cells outside the core, most of them as a rule, are solved by
+substitution (peeling.py). On the core Gauss-Seidel sweeps converge, from any x >= 0, at least as
 fast as Jacobi's, and keep every iterate >= 0. Where they converge slowly the system is solved
 directly, class by class: the strongly connected classes of M are visited in an order in which
 everything a class leads to is known, single cells by substitution, larger classes by sparse LU.
@@ -13,15 +14,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lmdsl import threads
+from lmdsl.peeling import Peeled
+from lmdsl.sweeps import CEILING, TOLERANCE, System
 
 Floats = NDArray[np.float64]
 
@@ -29,11 +29,8 @@ TRIAL_SWEEPS = 60
 MAX_SWEEPS = 200_000
 MAX_FACTORED = 100_000
 DENSE = 50
-TOLERANCE = 2e-15
-CEILING = 1e305
-NEVER = 1e308
-SPLIT = 100_000
-ONE = np.uint64(1)
+PER_CORE = 20
+"""The core may be swept more often than all cells, up to so many times."""
 
 Stop = Callable[[], bool]
 
@@ -45,51 +42,6 @@ class Stopped(Exception):
 def never() -> bool:
     """Return False: nothing ends the work early."""
     return False
-
-
-@dataclass(frozen=True)
-class System:
-    """x = b + M x with the diagonal solved for: x_i = (b_i + sum over j != i of M_ij x_j) / own_i.
-
-    Attributes
-    ----------
-    begin, end, indices, data
-        The rows of M without its diagonal: row i is ``begin[i]:end[i]``.
-    inverse
-        1 / (1 - M_ii), huge where M_ii >= 1: no finite x_i > 0 satisfies such a row.
-    b
-        Shape (n,), entries >= 0.
-    """
-
-    begin: NDArray[np.uint64]
-    end: NDArray[np.uint64]
-    indices: NDArray[np.uint32]
-    data: Floats
-    inverse: Floats
-    b: Floats
-
-    @classmethod
-    def of(cls, M: Any, b: Floats) -> System:
-        """Split a CSR array."""
-        n, entries = len(b), len(M.data)
-        end = np.empty(n, dtype=np.uint64)
-        indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
-        inverse = np.empty(n)
-        begin = M.indptr[:-1].astype(np.uint64)
-        _split(M.indptr, M.indices, M.data, end, indices, data, inverse)
-        return cls(begin, end, indices, data, inverse, b)
-
-    def sweep(
-        self, x: Floats, count: int, enough: float = TOLERANCE, flat: float = 0.0
-    ) -> tuple[float, float]:
-        """Make Gauss-Seidel sweeps in place; see :func:`_gauss_seidel`."""
-        if len(x) >= SPLIT:  # by size alone: the result does not depend on the threads
-            return _in_halves(self, x, count, enough, flat)
-        halfway, last = _gauss_seidel(
-            self.begin, self.end, self.indices, self.data, self.inverse, self.b, x, count, enough,
-            flat,
-        )  # fmt: skip
-        return float(halfway), float(last)
 
 
 def solve(
@@ -121,31 +73,110 @@ def solve(
         ``stop`` said so.
     """
     x = np.array(b if start is None else start, dtype=np.float64)
-    if (b == 0).any():
-        x[~_pays(M, b)] = 0.0  # exactly: a guess would only fade there
-    return solve_from(System.of(M, b), x, lambda: M, enough, flat, stop)
+    peeled = Peeled.of(System.of(M))
+    return x if solve_from(peeled, b, x, lambda: M, enough, flat, stop) else None
 
 
 def solve_from(
-    system: System,
+    peeled: Peeled,
+    b: Floats,
     x: Floats,
     matrix: Callable[[], Any],
     enough: float = TOLERANCE,
     flat: float = 0.0,
     stop: Stop = never,
+) -> bool:
+    """Solve in place from a guess; ``matrix`` makes M, as a CSR array, where sweeps are slow."""
+    core, inner = peeled.core, peeled.inner
+    whole = inner is peeled.system
+
+    def part() -> Any:
+        return matrix() if whole else matrix()[core][:, core]
+
+    y, c = (x, b) if whole else (x[core], b[core])
+    y = _solve(inner, c, y, part, enough, flat, stop)
+    if y is None:
+        return False
+    x[core] = y
+    return peeled.substitute(b, x)
+
+
+def solve_transposed(
+    peeled: Peeled,
+    b: Floats,
+    matrix: Callable[[], Any],
+    start: Floats | None = None,
+    enough: float = TOLERANCE,
+    flat: float = 0.0,
+    stop: Stop = never,
 ) -> Floats | None:
-    """Solve from a guess, which is overwritten; ``matrix`` makes M where sweeps are slow."""
-    change, rate = _trial(system, x, enough, flat)
+    """Return x >= 0 with x = b + M'x, or None; parameters as in :func:`solve_from`."""
+    x, core = b.copy(), peeled.core
+    if not peeled.flow(x):
+        return None
+    inner = peeled.inner.transposed()
+
+    def part() -> Any:
+        return matrix()[core][:, core].T.tocsr()
+
+    c = x[core]
+    y = _solve(inner, c, c.copy() if start is None else start[core], part, enough, flat, stop)
+    if y is None:
+        return None
+    x[core] = y
+    return x
+
+
+def advance(peeled: Peeled, b: Floats, x: Floats, count: int, enough: float, flat: float) -> float:
+    """Come closer to x = b + M x in place, by about the work of ``count`` sweeps.
+
+    From x >= b + M x it lowers x, from below it raises it, as sweeps do. A small core is swept to
+    the end where that is not too much work, then substituted from; where it is not small, all
+    cells are swept until the largest relative change is ``enough`` or no component moves by more
+    than ``flat``.
+
+    Returns
+    -------
+    float
+        Largest relative change of the last sweep, at most ``TOLERANCE`` where x is the solution;
+        infinite where there is none in sight.
+    """
+    if not peeled.small:
+        return peeled.system.sweep(b, x, count, enough, flat)[1]
+    change = 0.0
+    if len(peeled.core):
+        y = x[peeled.core]
+        count *= min(len(x) // len(y), PER_CORE)
+        change = peeled.inner.sweep(b[peeled.core], y, count, TOLERANCE)[1]
+        if not change < np.inf:
+            return np.inf
+        x[peeled.core] = y
+    return change if peeled.substitute(b, x) else np.inf
+
+
+def _solve(
+    system: System,
+    b: Floats,
+    x: Floats,
+    matrix: Callable[[], Any],
+    enough: float,
+    flat: float,
+    stop: Stop,
+) -> Floats | None:
+    """Solve from a guess, which is overwritten, by sweeps or class by class."""
+    if (b == 0).any():
+        x[~_pays(system, b)] = 0.0  # exactly: a guess would only fade there
+    change, rate = _trial(system, b, x, enough, flat)
     if change <= enough:
         return x
     if not _soon(change, rate):
-        direct, small_enough = solve_by_class(matrix(), system.b, stop)
+        direct, small_enough = solve_by_class(matrix(), b, stop)
         if direct is not None or small_enough:
             return direct
     for _ in range(MAX_SWEEPS // TRIAL_SWEEPS):
         if stop():
             raise Stopped
-        change, rate = _trial(system, x, enough, flat)
+        change, rate = _trial(system, b, x, enough, flat)
         if change <= enough:
             return x
         if not np.isfinite(change) or x.max() > CEILING:
@@ -153,12 +184,10 @@ def solve_from(
     return None
 
 
-def _pays(M: Any, b: Floats) -> NDArray[np.bool_]:
+def _pays(system: System, b: Floats) -> NDArray[np.bool_]:
     """Return where x > 0: the cells from which some b > 0 can be reached."""
-    pays = b > 0
-    before = M.T.tocsr()
-    before.eliminate_zeros()
-    _spread(before.indptr, before.indices, pays)
+    pays, before = b > 0, system.transposed()
+    _spread(before.begin, before.end, before.indices, pays)
     return pays
 
 
@@ -168,9 +197,9 @@ def _soon(change: float, rate: float) -> bool:
     return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < 300)
 
 
-def _trial(system: System, x: Floats, enough: float, flat: float) -> tuple[float, float]:
+def _trial(system: System, b: Floats, x: Floats, enough: float, flat: float) -> tuple[float, float]:
     """Sweep; return the last relative change, and the factor by which a sweep shrinks it."""
-    halfway, last = system.sweep(x, TRIAL_SWEEPS, enough, flat)
+    halfway, last = system.sweep(b, x, TRIAL_SWEEPS, enough, flat)
     rate = (last / halfway) ** (2 / TRIAL_SWEEPS) if 0 < halfway < np.inf else 0.0
     return last, rate
 
@@ -258,137 +287,21 @@ def _dense(inner: Any) -> Callable[[Floats], Floats]:
 
 
 @njit(cache=True, nogil=True)
-def _split(indptr, indices, data, end, out_indices, out_data, inverse):  # type: ignore[no-untyped-def]
-    for i in range(len(inverse)):
-        own, used = 0.0, indptr[i]
-        for e in range(indptr[i], indptr[i + 1]):
-            if indices[e] == i:
-                own += data[e]
-            else:
-                out_indices[used] = indices[e]
-                out_data[used] = data[e]
-                used += 1
-        inverse[i] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
-        end[i] = used
-
-
-@njit(cache=True, nogil=True)
-def _gauss_seidel(begin, end, indices, data, inverse, b, x, count, enough, flat):  # type: ignore[no-untyped-def]
-    """Sweep over the components, forwards and backwards in turn, using each as soon as known.
-
-    Staying put is summed up at once, so a chain of slow cells takes one sweep in its direction.
-    From x >= b + M x every sweep lowers x, from below it raises it. Returns the largest relative
-    change of the sweep halfway and of the last one; ends early where that is at most ``enough``,
-    where no component moved by more than ``flat`` (and calls the change 0), or where x is no longer
-    finite.
-    """
-    halfway, change, top = np.inf, np.inf, 0.0
-    for sweep in range(count):
-        measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
-        found = _sweep(
-            0, len(b), begin, end, indices, data, inverse, b, x, x, sweep % 2 == 1, measured, top
-        )
-        if measured:
-            change, top = found[0], found[2]
-            if not top < CEILING:
-                return halfway, np.inf
-            if sweep == count // 2:
-                halfway = change
-            if change <= enough:
-                break
-            if found[1] <= flat:
-                return halfway, 0.0
-    return halfway, change
-
-
-@njit(cache=True, nogil=True)
-def _sweep(  # type: ignore[no-untyped-def]
-    first, last, begin, end, indices, data, inverse, b, old, x, backwards, measured, top
-):
-    """Sweep over a range: ``x`` inside it, ``old`` outside; ``top`` was the largest component.
-
-    Returns the largest relative change, the largest absolute one, and the largest component.
-    """
-    floor, change, most, highest = 1e-14 * top + 1e-300, 0.0, 0.0, 0.0
-    first, last = np.uint64(first), np.uint64(last)
-    alone = first == np.uint64(0) and last == np.uint64(len(b))
-    for t in range(last - first):
-        i = last - ONE - t if backwards else first + t
-        y = b[i]
-        if alone:
-            for e in range(begin[i], end[i]):
-                y += data[e] * x[indices[e]]
-        else:
-            for e in range(begin[i], end[i]):
-                j = indices[e]
-                y += data[e] * (x[j] if first <= j < last else old[j])
-        y *= inverse[i]
-        if measured:
-            moved = abs(y - x[i])
-            if moved > change * max(y, floor):
-                change = moved / max(y, floor)
-            most = max(most, moved)
-            highest = max(highest, y)
-        x[i] = y
-    return change, most, highest
-
-
-def _in_halves(
-    system: System, x: Floats, count: int, enough: float, flat: float
-) -> tuple[float, float]:
-    """Make the same sweeps in two halves at a time, each with the other's last values."""
-    n = len(x)
-    halves = ((0, n // 2), (n // 2, n))
-    halfway, change, top = np.inf, np.inf, 0.0
-    now, then = x.copy(), x
-
-    def half(task: tuple[int, int, int, bool, float, Floats, Floats]) -> Any:
-        first, last, sweep, measured, highest, old, new = task
-        new[first:last] = old[first:last]
-        return _sweep(
-            first, last, system.begin, system.end, system.indices, system.data, system.inverse,
-            system.b, old, new, sweep % 2 == 1, measured, highest,
-        )  # fmt: skip
-
-    with ThreadPoolExecutor(min(threads.count(), 2)) as pool:
-        for sweep in range(count):
-            measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
-            now, then = then, now
-            tasks = [(*ends, sweep, measured, top, now, then) for ends in halves]
-            found = list(pool.map(half, tasks))
-            if not measured:
-                continue
-            change, most, top = (max(part[k] for part in found) for k in range(3))
-            if not top < CEILING:
-                change = np.inf
-                break
-            if sweep == count // 2:
-                halfway = change
-            if change <= enough:
-                break
-            if most <= flat:
-                change = 0.0
-                break
-    x[:] = then
-    return halfway, change
-
-
-@njit(cache=True, nogil=True)
-def _spread(indptr, indices, marked):  # type: ignore[no-untyped-def]
+def _spread(begin, end, indices, marked):  # type: ignore[no-untyped-def]
     """Mark everything that can reach a marked node."""
     queue = np.flatnonzero(marked)
     queue = np.append(queue, np.empty(len(marked) - len(queue), dtype=queue.dtype))
-    end = marked.sum()
-    start = 0
-    while start < end:
-        j = queue[start]
-        start += 1
-        for e in range(indptr[j], indptr[j + 1]):
+    last = marked.sum()
+    at = 0
+    while at < last:
+        j = queue[at]
+        at += 1
+        for e in range(begin[j], end[j]):
             i = indices[e]
             if not marked[i]:
                 marked[i] = True
-                queue[end] = i
-                end += 1
+                queue[last] = i
+                last += 1
 
 
 @njit(cache=True, nogil=True)

@@ -18,10 +18,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bellman, bounds, graph, linear
-from lmdsl.linear import ONE, Stopped, System, never
 from lmdsl.linear import Stop as Stop
+from lmdsl.linear import Stopped, never
 from lmdsl.lp import StabilizationLP
+from lmdsl.peeling import Peeled
 from lmdsl.screening import Pass, Screen
+from lmdsl.sweeps import CEILING, ONE, TOLERANCE
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
@@ -41,7 +43,7 @@ def evaluate(
     start: Floats | None = None,
     transient: bool = False,
     stop: Stop = never,
-    system: System | None = None,
+    rows: Peeled | None = None,
 ) -> Floats | None:
     """Return V = G_u + gamma P_u V, shape (n,); None where the policy has no finite value.
 
@@ -57,19 +59,22 @@ def evaluate(
         The policy is known to be gamma-stabilizing, which saves looking whether it reaches A.
     stop
         Ends the work, with :class:`lmdsl.linear.Stopped`.
-    system
-        Its rows, where they are at hand.
+    rows
+        gamma P_u, where it is at hand.
     """
     gamma = lp.gamma if gamma is None else gamma
     b = (lp.cost if cost is None else cost)[pair]
     if gamma >= 1 and not transient and not reaches_attractor(lp, pair).all():
         return None
-    if (b == 0).any():
-        return linear.solve(gamma * lp.rows.matrix(pair), b, start, stop=stop)
     x = np.array(b if start is None else start, dtype=np.float64)
-    if system is None:
-        system = lp.rows.system(pair, gamma, b)
-    return linear.solve_from(system, x, lambda: gamma * lp.rows.matrix(pair), stop=stop)
+    rows = peeled(lp, pair, gamma) if rows is None else rows
+    found = linear.solve_from(rows, b, x, lambda: gamma * lp.rows.matrix(pair), stop=stop)
+    return x if found else None
+
+
+def peeled(lp: StabilizationLP, pair: Pairs, gamma: float) -> Peeled:
+    """Return gamma P_u, ready for :func:`evaluate`."""
+    return Peeled.of(lp.rows.system(pair, gamma))
 
 
 def reaches_attractor(lp: StabilizationLP, pair: Pairs) -> Bools:
@@ -155,39 +160,43 @@ def iterate(
     """
     screen = Screen(lp, gamma, cost)
     gamma, cost = screen.gamma, screen.cost
-    system: System | None = None  # the rows of the policy at hand
+    rows: Peeled | None = None  # those of the policy at hand
     V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
     while True:
         out = stop() or step == limit
         done = screen.improve(V, pair, TIE) if not out else Pass(V, pair, 0, 0)
         if done.changed:
+            step += 1
             x = done.value.copy()
             sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
-            enough = 0.1 * _fall(V, x)
-            system = lp.rows.system(done.pair, gamma, cost[done.pair])
-            system.sweep(x, sweeps, enough)
+            rows = peeled(lp, done.pair, gamma)
+            left = linear.advance(rows, cost[done.pair], x, sweeps, 0.1 * _fall(V, x), 0.0)
+            exact = x if left <= TOLERANCE else None
             x = np.minimum(x, done.value)
             screen.follow(V, x)
             pair, V = done.pair, x
-            step += 1
-            continue
-        if last is not None and last[0] is pair:
+        elif last is not None and last[0] is pair:
             return Iteration(*last, step, not out, screen)
-        try:
-            exact = evaluate(
-                lp, pair, gamma, cost, done.value, transient=True, stop=stop, system=system
-            )
+        else:
+            try:
+                exact = evaluate(
+                    lp, pair, gamma, cost, done.value, transient=True, stop=stop, rows=rows
+                )
+                if exact is None:
+                    exact = evaluate(lp, pair, gamma, cost, stop=stop)
+            except Stopped:
+                exact = None
             if exact is None:
-                exact = evaluate(lp, pair, gamma, cost, stop=stop)
-        except Stopped:
-            return Iteration(*(last or (pair, V)), step, False, screen)
-        if exact is None or (last is not None and not (exact < last[1]).any()):
-            # Rounding made a change look better than it is.
-            return Iteration(*(last or (pair, V)), step, last is not None and not out, screen)
-        screen.follow(V, np.minimum(exact, V))
-        last, V = (pair, exact), exact
+                return Iteration(*(last or (pair, V)), step, False, screen)
+            screen.follow(V, np.minimum(exact, V))
+            V = exact
+        if exact is not None:
+            if last is not None and not (exact < last[1]).any():
+                # Rounding made a change look better than it is.
+                return Iteration(*last, step, not out, screen)
+            last = pair, exact
         if out:
-            return Iteration(*last, step, False, screen)
+            return Iteration(*(last or (pair, V)), step, False, screen)
 
 
 def _fall(before: Floats, after: Floats) -> float:
@@ -206,7 +215,7 @@ def bound(lp: StabilizationLP, pair: Pairs, w: Floats | None = None) -> Floats |
         return None
     with np.errstate(over="ignore"):
         V: Floats = w * (float((lp.cost[pair] / d).max()) * (1 + 1e-12))
-    return V if (V < linear.CEILING).all() else None
+    return V if (V < CEILING).all() else None
 
 
 def canonical(
@@ -275,7 +284,7 @@ def stability_vector(
     g: float | None = None,
     sharp: bool = False,
     stop: Stop = never,
-    system: System | None = None,
+    rows: Peeled | None = None,
 ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return w > 0, d > 0 with w >= g P_u w + d: a proof that the policy is g-stabilizing.
 
@@ -287,10 +296,9 @@ def stability_vector(
         return guess, d
     unit = np.ones(lp.n)
     w = unit.copy()
-    if system is None:
-        system = lp.rows.system(pair, g, unit)
+    rows = peeled(lp, pair, g) if rows is None else rows
     # Sweeps from below leave 1 + g P w - w at most what they still move.
-    if system.sweep(w, 128, 0.0, 1e-2 if sharp else 0.25)[1] < np.inf:
+    if linear.advance(rows, unit, w, 128, 0.0, 1e-2 if sharp else 0.25) < np.inf:
         d = bounds.decrease(lp, pair, w, g)
         if d is not None:
             return w, d

@@ -24,8 +24,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import threads
-from lmdsl.linear import NEVER, ONE, SPLIT, System
 from lmdsl.sampling import Nodes
+from lmdsl.sweeps import NEVER, ONE, SPLIT, System
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,8 @@ class Rows:
         entry = np.repeat(self.pointer[rows] - pointer[:-1], length) + np.arange(pointer[-1])
         return Rows(pointer, self.target[entry], self.code[entry], self.shares, self.columns)
 
-    def system(self, rows: NDArray[np.int64], gamma: float, b: NDArray[np.float64]) -> System:
-        """Return x = b + gamma P x for one row per column, ready for sweeps."""
+    def system(self, rows: NDArray[np.int64], gamma: float) -> System:
+        """Return gamma P for one row per column, ready for sweeps."""
         count = len(rows)
         chosen, columns = rows.view(np.uint64), np.uint32(self.columns)
         begin, end = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
@@ -157,7 +157,7 @@ class Rows:
         entries = int(begin[-1] + end[-1]) if count else 0
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
         deque(threads.in_order(fill, pairwise(edges)), maxlen=0)
-        return System(begin, end, indices, data, inverse, b)
+        return System(begin, end, indices, data, inverse)
 
     def matrix(self, rows: NDArray[np.integer] | None = None):  # type: ignore[no-untyped-def]
         """Return rows as a SciPy CSR array of doubles, shape (len(rows), columns).

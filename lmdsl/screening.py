@@ -17,8 +17,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bellman
-from lmdsl.linear import ONE
 from lmdsl.lp import StabilizationLP
+from lmdsl.sweeps import ONE
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]

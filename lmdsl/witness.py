@@ -5,7 +5,6 @@ Nothing here is trusted: certificate.check judges what comes out.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from lmdsl.certificate import (
     weighted,
 )
 from lmdsl.lp import StabilizationLP
+from lmdsl.peeling import Peeled
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
@@ -52,10 +52,10 @@ def certify(
     value, w
         Guesses of the policy's value and its unit-cost value; made where missing.
     """
-    rows = lp.rows.system(pair, lp.gamma, lp.cost[pair])
-    unit = replace(rows, b=np.ones(lp.n)) if lp.growth == lp.gamma else None
-    w, d = policy.stability_vector(lp, pair, w, sharp=True, system=unit)
-    V = policy.evaluate(lp, pair, start=value, transient=w is not None, system=rows)
+    rows = policy.peeled(lp, pair, lp.gamma)
+    growing = rows if lp.growth == lp.gamma else None
+    w, d = policy.stability_vector(lp, pair, w, sharp=True, rows=growing)
+    V = policy.evaluate(lp, pair, start=value, transient=w is not None, rows=rows)
     if V is None:
         witness = Witness(pair, w, None, lower_vector(lp, None, tolerance), None)
         return Verified(check(lp, witness, tolerance), witness)
@@ -67,7 +67,7 @@ def certify(
         V_up = _lesser(lp, V_up, _upper_with_slack(lp, pair, slack))
         W = _greater(lp, W, _lower_with_slack(lp, pair, V, slack))
         best = gap(lp, V_up, W)
-    witness = Witness(pair, w, V_up, W, _measure_vector(lp, pair))
+    witness = Witness(pair, w, V_up, W, _measure_vector(lp, pair, rows))
     return Verified(check(lp, witness, tolerance), witness)
 
 
@@ -148,10 +148,13 @@ def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
     return None
 
 
-def _measure_vector(lp: StabilizationLP, pair: Pairs) -> Floats | None:
-    inflow: Any = lp.gamma * lp.rows.matrix(pair).T.tocsr()
+def _measure_vector(lp: StabilizationLP, pair: Pairs, rows: Peeled) -> Floats | None:
+    def matrix() -> Any:
+        return lp.gamma * lp.rows.matrix(pair)
+
     # The residual counts in absolute terms, summed over all cells.
-    mu = linear.solve(inflow, lp.weight, flat=1e-2 * MEASURE_TOLERANCE / lp.n)
+    flat = 1e-2 * MEASURE_TOLERANCE / lp.n
+    mu = linear.solve_transposed(rows, lp.weight, matrix, flat=flat)
     if mu is not None and check_measure(lp, pair, mu) > MEASURE_TOLERANCE:
-        mu = linear.solve(inflow, lp.weight, start=mu)
+        mu = linear.solve_transposed(rows, lp.weight, matrix, start=mu)
     return mu

@@ -29,6 +29,8 @@ systems
 declarations
 problem
 sampling memory threads merging
+sweeps
+peeling
 linear
 partition rows
 boxes

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import bellman, linear, rows, threads
+from lmdsl import bellman, linear, rows, sweeps, threads
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -16,7 +16,7 @@ def test_ranges_and_halves_give_the_same_policy(monkeypatch, workers):
     problem = made(standard_map(16))
     whole = lm.solve(problem)
     monkeypatch.setattr(bellman, "GRAIN", 1)
-    monkeypatch.setattr(linear, "SPLIT", 1)
+    monkeypatch.setattr(sweeps, "SPLIT", 1)
     monkeypatch.setattr(rows, "SPLIT", 1)
     monkeypatch.setattr(threads, "count", lambda: workers)
     parts = lm.solve(problem)
@@ -31,7 +31,7 @@ def test_halves_solve_the_system(monkeypatch):
     M = sp.random_array((n, n), density=0.1, rng=rng, format="csr")
     M.data *= 0.9 / np.maximum(M.sum(axis=1), 1e-9).max()
     b = rng.random(n)
-    monkeypatch.setattr(linear, "SPLIT", 1)
+    monkeypatch.setattr(sweeps, "SPLIT", 1)
     x = linear.solve(M, b)
     np.testing.assert_allclose(x, np.linalg.solve(np.eye(n) - M.toarray(), b), rtol=1e-12)
 

@@ -1,0 +1,112 @@
+"""Peeling a system: the cells outside the core by substitution, the core by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
+
+from lmdsl import linear
+from lmdsl.peeling import Peeled
+from lmdsl.sweeps import System
+
+
+def matrix(seed, n, cyclic, radius=0.9):
+    """Return a nonnegative matrix: arbitrary among the first cells, else only to lower ones."""
+    rng = np.random.default_rng(seed)
+    dense = rng.random((n, n)) * (rng.random((n, n)) < 3 / n)
+    allowed = np.tri(n, dtype=bool)
+    allowed[:cyclic, :cyclic] = True
+    dense = np.where(allowed, dense, 0.0)
+    dense *= radius / max(dense.sum(axis=1).max(), 1e-9)
+    shuffle = rng.permutation(n)
+    return sp.csr_array(dense[np.ix_(shuffle, shuffle)])
+
+
+def cases(test):
+    """Run a test on random systems."""
+    given_cases = given(st.integers(0, 10_000), st.integers(1, 40), st.integers(0, 12))
+    return settings(deadline=None)(given_cases(test))
+
+
+@cases
+def test_core_is_closed_and_holds_every_cycle(seed, n, cyclic):
+    M = matrix(seed, n, min(cyclic, n))
+    peeled = Peeled.of(System.of(M))
+    core = np.zeros(n, dtype=bool)
+    core[peeled.core] = True
+    off = M.toarray() * (1 - np.eye(n))
+    assert sorted([*peeled.core, *peeled.order]) == list(range(n))
+    assert not off[np.ix_(core, ~core)].any()  # nothing leads out of it
+    place = np.full(n, n)
+    place[peeled.order] = np.arange(len(peeled.order))
+    for i in peeled.order:
+        assert (place[np.flatnonzero(off[i])] > place[i]).all()
+    _, label = connected_components(sp.csr_array(off), connection="strong")
+    assert core[np.bincount(label)[label] > 1].all()
+
+
+@cases
+def test_solutions_agree_with_dense_ones(seed, n, cyclic):
+    M = matrix(seed, n, min(cyclic, n))
+    rng = np.random.default_rng(seed + 1)
+    b = rng.random(n) * (rng.random(n) < 0.7)  # some exact zeros
+    peeled, whole = Peeled.of(System.of(M)), np.eye(n) - M.toarray()
+    x = rng.random(n)
+    assert linear.solve_from(peeled, b, x, lambda: M)
+    np.testing.assert_allclose(x, np.linalg.solve(whole, b), rtol=1e-12, atol=1e-300)
+    mu = linear.solve_transposed(peeled, b, lambda: M)
+    np.testing.assert_allclose(mu, np.linalg.solve(whole.T, b), rtol=1e-11, atol=1e-300)
+    for start in (None, rng.random(n)):
+        np.testing.assert_array_equal(
+            linear.solve_transposed(peeled, np.zeros(n), lambda: M, start=start), 0
+        )
+
+
+@cases
+def test_advancing_stays_on_its_side(seed, n, cyclic):
+    M = matrix(seed, n, min(cyclic, n))
+    b = np.random.default_rng(seed + 2).random(n) + 0.1
+    exact = np.linalg.solve(np.eye(n) - M.toarray(), b)
+    for factor in (0.5, 2.0):  # below b + M x, and above
+        x = factor * exact
+        before = x.copy()
+        linear.advance(Peeled.of(System.of(M)), b, x, 2, 0.0, 0.0)
+        ahead = b + M @ x
+        if factor < 1:
+            assert (x >= before * (1 - 1e-13)).all()
+            assert (x <= ahead * (1 + 1e-13)).all()
+        else:
+            assert (x <= before * (1 + 1e-13)).all()
+            assert (x >= ahead * (1 - 1e-13)).all()
+
+
+def test_a_system_without_cycles_is_solved_at_once():
+    M = matrix(0, 200, 0)
+    peeled = Peeled.of(System.of(M))
+    assert not len(peeled.core)
+    x = np.zeros(200)
+    assert linear.advance(peeled, np.ones(200), x, 1, 0.0, 0.0) == 0.0
+    np.testing.assert_allclose(x - M @ x, 1.0, rtol=1e-13)
+
+
+@pytest.mark.parametrize("own", [1.0, 1.5])
+def test_staying_for_ever_has_no_solution_where_something_is_paid(own):
+    M = sp.csr_array(np.array([[own, 0.0], [0.5, 0.0]]))
+    peeled = Peeled.of(System.of(M))
+    for b in (np.array([1e-200, 1.0]), np.array([1.0, 0.0])):
+        assert not linear.solve_from(peeled, b, b.copy(), lambda: M)
+        assert linear.advance(peeled, b, b.copy(), 9, 0.0, 0.0) == np.inf
+    x = np.zeros(2)
+    assert linear.solve_from(peeled, np.array([0.0, 1.0]), x, lambda: M)
+    np.testing.assert_array_equal(x, [0.0, 1.0])
+
+
+def test_a_growing_cycle_has_no_solution():
+    M = sp.csr_array(np.array([[0.0, 1.1, 0.0], [1.0, 0.0, 0.0], [0.5, 0.5, 0.0]]))
+    peeled = Peeled.of(System.of(M))
+    assert list(peeled.core) == [0, 1]
+    assert not linear.solve_from(peeled, np.ones(3), np.ones(3), lambda: M)
