@@ -33,12 +33,27 @@ MAX_EXACT = 20_000
 
 def expected_above(lp: StabilizationLP, pair: Pairs, x: Floats, gamma: float) -> Floats:
     """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
-    upper = np.empty(lp.n)
-    _above(
-        pair.view(np.uint64), *lp.rows.kernel, gamma, padded(x),
-        tame(lp, x, gamma), upper,
-    )  # fmt: skip
+    upper, V, plain = np.empty(lp.n), padded(x), tame(lp, x, gamma)
+
+    def part(cells: tuple[int, int]) -> None:
+        _above(*cells, pair.view(np.uint64), *lp.rows.kernel, gamma, V, plain, upper)
+
+    over_cells(lp, part)
     return upper
+
+
+def inflow(
+    lp: StabilizationLP, pair: Pairs, mu: Floats, gamma: float
+) -> tuple[Floats, Floats, Floats]:
+    """Return gamma P_u'mu as summed in doubles, and its rounding error: relative and absolute.
+
+    The relative error also covers two more operations with the sum. Each of shape (n,).
+    """
+    total, entries = np.zeros(lp.n + 1), np.zeros(lp.n + 1)
+    _inflow(pair.view(np.uint64), *lp.rows.kernel, gamma, mu, total, entries)
+    terms = entries[:-1] + 8
+    absolute = (1 + gamma) * terms * LEAST * (1 + mu.max(initial=0.0))
+    return total[:-1], terms * UNIT, absolute
 
 
 def decrease(lp: StabilizationLP, pair: Pairs, w: Floats, g: float) -> Floats | None:
@@ -167,6 +182,14 @@ def total(values: Floats) -> float:
         return math.inf
 
 
+def total_above(values: Floats) -> float:
+    """Return an upper bound of the sum of values >= 0, the sum correctly rounded if not many."""
+    if len(values) <= MOST_EXACT_TERMS:
+        return total(values) * (1 + 4 * UNIT)
+    # NumPy adds pairwise: fewer than 64 roundings deep.
+    return float(values.sum()) * (1 + 70 * UNIT)
+
+
 def weighted(weight: Floats, values: Floats, direction: float) -> float:
     """Return weight'values rounded towards ``direction`` (an infinity), for values >= 0.
 
@@ -277,8 +300,17 @@ def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def _above(pair, pointer, target, code, share, gamma, V, plain, upper):  # type: ignore[no-untyped-def]
+def _inflow(pair, pointer, target, code, share, gamma, mu, total, entries):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(pair))):
+        k = pair[i]
+        for e in range(pointer[k], pointer[k + ONE]):
+            total[target[e]] += gamma * (share[code[e]] * mu[i])
+            entries[target[e]] += 1.0
+
+
+@njit(cache=True, nogil=True)
+def _above(first, last, pair, pointer, target, code, share, gamma, V, plain, upper):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(first), np.uint64(last)):
         k = pair[i]
         if plain:
             q = 0.0

@@ -142,18 +142,16 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
     """
     if not (np.isfinite(mu).all() and (mu >= 0).all()):
         return math.inf
-    P = lp.rows.matrix(pair)
     with np.errstate(over="ignore", invalid="ignore"):
-        inflow = lp.gamma * (P.T @ mu)
-        entries = np.bincount(P.indices, minlength=lp.n)
-        rounding = (entries + 8) * bounds.UNIT * (lp.weight + mu + inflow)
-        rounding += (1 + lp.gamma) * (entries + 8) * bounds.LEAST * (1 + mu.max(initial=0.0))
+        inflow, relative, absolute = bounds.inflow(lp, pair, mu, lp.gamma)
+        rounding = relative * (lp.weight + mu + inflow) + absolute
         residual = np.abs((lp.weight - mu) + inflow)
     if not np.isfinite(residual).all():
         return math.inf
-    bound = bounds.total(residual + rounding) * (1 + 4 * bounds.UNIT)
-    hopeful = bound - 2 * bounds.total(rounding) <= MEASURE_TOLERANCE < bound
-    if hopeful and len(P.data) <= bounds.MAX_EXACT:
+    bound = bounds.total_above(residual + rounding)
+    hopeful = bound - 2 * bounds.total_above(rounding) <= MEASURE_TOLERANCE < bound
+    entries = lp.rows.pointer[pair + 1] - lp.rows.pointer[pair]
+    if hopeful and entries.sum() <= bounds.MAX_EXACT:
         policy_rows = (row for _, row in rational.rows(lp, pair))
         return rational.rounded_up(
             rational.residual(lp, policy_rows, [*map(Fraction, mu.tolist())])
@@ -184,11 +182,14 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
     V_up, W, mu, w = witness.V_up, witness.W, witness.mu, witness.w
     if pair is not None and not is_policy(lp, pair):
         pair = None
-    contraction = None if pair is None or w is None else check_stabilizing(lp, pair, w)
-    upper = pair is not None and V_up is not None and check_upper(lp, pair, V_up)
+    contraction = residual = cost = floor = None
+    upper = False
+    if pair is not None:
+        under, own = lp.under(pair), np.arange(lp.n)
+        contraction = None if w is None else check_stabilizing(under, own, w)
+        upper = V_up is not None and check_upper(under, own, V_up)
+        residual = None if mu is None else check_measure(under, own, mu)
     lower = W is not None and check_lower(lp, W)
-    residual = None if pair is None or mu is None else check_measure(lp, pair, mu)
-    cost = floor = None
     if upper and V_up is not None:
         cost = bounds.weighted(lp.weight, V_up, math.inf)
     if lower and W is not None:

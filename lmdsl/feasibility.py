@@ -51,9 +51,9 @@ class Undecided:
 
 def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
     """Sweep a guess of the unit-cost value until it proves a policy g-stabilizing, a while."""
-    w = w.copy()
-    linear.advance(peeled(lp, pair, lp.growth), np.ones(lp.n), w, MOST_SWEEPS, 0.0, 0.25)
-    return w if bounds.decrease(lp, pair, w, lp.growth) is not None else None
+    under, own, w = lp.under(pair), np.arange(lp.n), w.copy()
+    linear.advance(peeled(under, own, lp.growth), np.ones(lp.n), w, MOST_SWEEPS, 0.0, 0.25)
+    return w if bounds.decrease(under, own, w, lp.growth) is not None else None
 
 
 def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused | Undecided:

@@ -93,8 +93,8 @@ def solve_from(
     def part() -> Any:
         return matrix() if whole else matrix()[core][:, core]
 
-    y, c = (x, b) if whole else (x[core], b[core])
-    y = _solve(inner, c, y, part, enough, flat, stop)
+    guess, c = (x, b) if whole else (x[core], b[core])
+    y = _solve(inner, c, guess, part, enough, flat, stop)
     if y is None:
         return False
     x[core] = y

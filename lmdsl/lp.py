@@ -166,6 +166,16 @@ class StabilizationLP:
             weight=self.weight[inside],
         )
 
+    def under(self, pair: NDArray[np.int64]) -> StabilizationLP:
+        """Return the model under a policy, a column per cell: its only policy is ``arange(n)``."""
+        return replace(
+            self,
+            pair_pointer=np.arange(self.n + 1, dtype=np.int64),
+            control=self.control[pair],
+            rows=self.rows.take(pair),
+            cost=self.cost[pair],
+        )
+
     @cached_property
     def tree(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""

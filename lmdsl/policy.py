@@ -206,16 +206,21 @@ def _fall(before: Floats, after: Floats) -> float:
 
 
 def bound(lp: StabilizationLP, pair: Pairs, w: Floats | None = None) -> Floats | None:
-    """Return V >= T_u V of a g-stabilizing policy, None where none is found quickly.
+    """Return V >= T_u V of a g-stabilizing policy, close to its value; None where none is found.
 
-    With w >= g P_u w + d, c w serves as soon as c d >= G_u.
+    With w >= g P_u w + d, c w serves as soon as c d >= G_u; sweeps then lower it.
     """
-    w, d = stability_vector(lp, pair, w)
+    under, own = lp.under(pair), np.arange(lp.n)
+    w, d = stability_vector(under, own, w)
     if w is None or d is None:
         return None
     with np.errstate(over="ignore"):
-        V: Floats = w * (float((lp.cost[pair] / d).max()) * (1 + 1e-12))
-    return V if (V < CEILING).all() else None
+        V: Floats = w * (float((under.cost / d).max()) * (1 + 1e-12))
+    if not (V < CEILING).all():
+        return None
+    x = V.copy()
+    linear.advance(peeled(under, own, lp.gamma), under.cost, x, MOST_SWEEPS, 1e-2, 0.0)
+    return np.minimum(x, V)
 
 
 def canonical(

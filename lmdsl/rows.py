@@ -129,10 +129,22 @@ class Rows:
 
     def take(self, rows: NDArray[np.integer]) -> Rows:
         """Return some of the rows, in the given order."""
-        length = self.pointer[rows + 1] - self.pointer[rows]
-        pointer = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
-        entry = np.repeat(self.pointer[rows] - pointer[:-1], length) + np.arange(pointer[-1])
-        return Rows(pointer, self.target[entry], self.code[entry], self.shares, self.columns)
+        chosen = np.ascontiguousarray(rows, dtype=np.int64).view(np.uint64)
+        pointer = np.zeros(len(chosen) + 1, dtype=np.int64)
+        spans = _spans(len(chosen))
+
+        def lengths(span: tuple[int, int]) -> None:
+            _lengths(*span, chosen, self.kernel[0], pointer[1:])
+
+        def copy(span: tuple[int, int]) -> None:
+            _take(*span, chosen, *self.kernel[:3], pointer, target, code)
+
+        deque(threads.in_order(lengths, spans), maxlen=0)
+        np.cumsum(pointer, out=pointer)
+        target = np.empty(int(pointer[-1]), dtype=np.int32)
+        code = np.empty(int(pointer[-1]), dtype=self.code.dtype)
+        deque(threads.in_order(copy, spans), maxlen=0)
+        return Rows(pointer, target, code, self.shares, self.columns)
 
     def system(self, rows: NDArray[np.int64], gamma: float) -> System:
         """Return gamma P for one row per column, ready for sweeps."""
@@ -140,23 +152,22 @@ class Rows:
         chosen, columns = rows.view(np.uint64), np.uint32(self.columns)
         begin, end = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
         inverse = np.empty(count)
-        parts = 8 if count >= SPLIT else 1
-        edges = np.linspace(0, count, parts + 1).astype(np.int64).tolist()
+        spans = _spans(count)
 
-        def lengths(cells: tuple[int, int]) -> None:
-            _lengths(*cells, chosen, self.kernel[0], end)
+        def lengths(span: tuple[int, int]) -> None:
+            _lengths(*span, chosen, self.kernel[0], end)
 
-        def fill(cells: tuple[int, int]) -> None:
+        def fill(span: tuple[int, int]) -> None:
             _gather_split(
-                *cells, chosen, *self.kernel, columns, gamma, begin, end, indices, data, inverse
+                *span, chosen, *self.kernel, columns, gamma, begin, end, indices, data, inverse
             )
 
-        deque(threads.in_order(lengths, pairwise(edges)), maxlen=0)
+        deque(threads.in_order(lengths, spans), maxlen=0)
         begin[:1] = 0
         np.cumsum(end[:-1], out=begin[1:])
         entries = int(begin[-1] + end[-1]) if count else 0
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
-        deque(threads.in_order(fill, pairwise(edges)), maxlen=0)
+        deque(threads.in_order(fill, spans), maxlen=0)
         return System(begin, end, indices, data, inverse)
 
     def matrix(self, rows: NDArray[np.integer] | None = None):  # type: ignore[no-untyped-def]
@@ -181,6 +192,21 @@ class Rows:
         if not self.shares.merged:
             matrix.sum_duplicates()
         return matrix
+
+
+def _spans(count: int) -> list[tuple[int, int]]:
+    """Split rows among threads where there are many; the parts do not depend on the threads."""
+    parts = 8 if count >= SPLIT else 1
+    return list(pairwise(np.linspace(0, count, parts + 1).astype(np.int64).tolist()))
+
+
+@njit(cache=True, nogil=True)
+def _take(first, last, rows, pointer, target, code, out_pointer, out_target, out_code):  # type: ignore[no-untyped-def]
+    for r in range(np.uint64(first), np.uint64(last)):
+        shift = np.uint64(out_pointer[r]) - pointer[rows[r]]
+        for e in range(pointer[rows[r]], pointer[rows[r] + ONE]):
+            out_target[e + shift] = target[e]
+            out_code[e + shift] = code[e]
 
 
 @njit(cache=True, nogil=True)

@@ -5,6 +5,7 @@ Nothing here is trusted: certificate.check judges what comes out.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,14 +53,27 @@ def certify(
     value, w
         Guesses of the policy's value and its unit-cost value; made where missing.
     """
-    rows = policy.peeled(lp, pair, lp.gamma)
+    under, own = lp.under(pair), np.arange(lp.n)
+    rows = policy.peeled(under, own, lp.gamma)
     growing = rows if lp.growth == lp.gamma else None
-    w, d = policy.stability_vector(lp, pair, w, sharp=True, rows=growing)
-    V = policy.evaluate(lp, pair, start=value, transient=w is not None, rows=rows)
+    w, d = policy.stability_vector(under, own, w, sharp=True, rows=growing)
+    V = policy.evaluate(under, own, start=value, transient=w is not None, rows=rows)
     if V is None:
         witness = Witness(pair, w, None, lower_vector(lp, None, tolerance), None)
         return Verified(check(lp, witness, tolerance), witness)
-    V_up, W = upper_vector(lp, pair, V, w, d), lower_vector(lp, V, tolerance)
+    V_up, mu = upper_vector(under, own, V, w, d), _measure_vector(under, rows)
+    witness = Witness(pair, w, V_up, _guessed(under, V, tolerance), mu)
+    proof = check(lp, witness, tolerance)
+    if proof.gap is None or proof.gap > tolerance:
+        witness = _tightened(lp, witness, V, tolerance)
+        proof = check(lp, witness, tolerance)
+    return Verified(proof, witness)
+
+
+def _tightened(lp: StabilizationLP, witness: Witness, V: Floats, tolerance: float) -> Witness:
+    """Bring the bounds of the cost together, where the first try did not."""
+    pair, V_up, W = witness.pair, witness.V_up, lower_vector(lp, V, tolerance)
+    assert pair is not None
     best = gap(lp, V_up, W)
     for slack in RELATIVE_SLACK:
         if best <= tolerance:
@@ -67,8 +81,7 @@ def certify(
         V_up = _lesser(lp, V_up, _upper_with_slack(lp, pair, slack))
         W = _greater(lp, W, _lower_with_slack(lp, pair, V, slack))
         best = gap(lp, V_up, W)
-    witness = Witness(pair, w, V_up, W, _measure_vector(lp, pair, rows))
-    return Verified(check(lp, witness, tolerance), witness)
+    return replace(witness, V_up=V_up, W=W)
 
 
 def _upper_with_slack(lp: StabilizationLP, pair: Pairs, slack: float) -> Floats | None:
@@ -135,6 +148,15 @@ def lower_vector(lp: StabilizationLP, V: Floats | None, tolerance: float) -> Flo
     return best
 
 
+def _guessed(under: StabilizationLP, V: Floats, tolerance: float) -> Floats | None:
+    """W = (1 - eps) V, with eps G_u far above what rounding takes from V and from the check."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = float(np.where(V > 0, V / under.cost, 0.0).max(initial=0.0))
+    # Rows have at most as many entries as there are codes.
+    eps = 8 * (len(under.rows.shares.value) + 12) * bounds.UNIT * share
+    return V * (1 - eps) if eps < tolerance / 4 else None
+
+
 def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
     """W = (1 - eps) V: it serves once r_a <= eps/(1 - eps) G_a for every surviving pair."""
     worst, stuck = bounds.worst_excess(lp, V)
@@ -148,13 +170,13 @@ def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
     return None
 
 
-def _measure_vector(lp: StabilizationLP, pair: Pairs, rows: Peeled) -> Floats | None:
+def _measure_vector(under: StabilizationLP, rows: Peeled) -> Floats | None:
     def matrix() -> Any:
-        return lp.gamma * lp.rows.matrix(pair)
+        return under.gamma * under.rows.matrix()
 
     # The residual counts in absolute terms, summed over all cells.
-    flat = 1e-2 * MEASURE_TOLERANCE / lp.n
-    mu = linear.solve_transposed(rows, lp.weight, matrix, flat=flat)
-    if mu is not None and check_measure(lp, pair, mu) > MEASURE_TOLERANCE:
-        mu = linear.solve_transposed(rows, lp.weight, matrix, start=mu)
+    flat = 1e-2 * MEASURE_TOLERANCE / under.n
+    mu = linear.solve_transposed(rows, under.weight, matrix, flat=flat)
+    if mu is not None and check_measure(under, np.arange(under.n), mu) > MEASURE_TOLERANCE:
+        mu = linear.solve_transposed(rows, under.weight, matrix, start=mu)
     return mu
