@@ -43,7 +43,7 @@ def killing(*arguments):
 def test_killed_at_random_moments(tmp_path):
     found = killing("random", tmp_path, 200, 0)
     print(found)
-    outcomes = ("old", "new", "none, none before", "none, one before")
+    outcomes = ("old", "new", "put back", "none, none before", "none, one before")
     assert sum(found.get(name, 0) for name in outcomes) == 200
     assert found["old"] > 0  # kills did fall into saves
     assert found["left behind"] > 0
