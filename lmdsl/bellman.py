@@ -25,6 +25,9 @@ T = TypeVar("T")
 GRAIN = 500_000
 """Transitions that are worth a thread."""
 
+IN_PLACE = 4
+"""Ranges of a pass in which a cell sees the new values of its own range only: few, to see much."""
+
 
 @dataclass(frozen=True)
 class Improvement:
@@ -47,12 +50,14 @@ def padded(V: Floats) -> Floats:
     return np.append(np.asarray(V, dtype=np.float64), 0.0)
 
 
-def over_cells(lp: StabilizationLP, part: Callable[[tuple[int, int]], T]) -> list[T]:
+def over_cells(
+    lp: StabilizationLP, part: Callable[[tuple[int, int]], T], most: int = 16
+) -> list[T]:
     """Call ``part`` on ranges of cells that cover C, in several threads where that pays.
 
-    The ranges, and so the results, do not depend on the number of threads.
+    The ranges, ``most`` at most, do not depend on the number of threads; nor do the results.
     """
-    count = max(1, min(len(lp.rows.target) // GRAIN, 16, lp.n))
+    count = max(1, min(len(lp.rows.target) // GRAIN, most, lp.n))
     ends = np.linspace(0, lp.n, count + 1).astype(np.int64).tolist()
     ranges = list(pairwise(ends))
     return [part(ranges[0])] if count == 1 else list(threads.in_order(part, ranges))
@@ -109,7 +114,7 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
             gamma, x, backwards, value, pair,
         )  # fmt: skip
 
-    over_cells(lp, part)
+    over_cells(lp, part, IN_PLACE)
     return Improvement(value, pair)
 
 

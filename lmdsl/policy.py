@@ -34,6 +34,9 @@ TIE = 1e-12
 
 LEAST_SWEEPS, MOST_SWEEPS = 12, 60
 
+FEW = 500
+"""Changes in fewer than one of so many cells: another pass costs less than evaluating them."""
+
 
 def evaluate(
     lp: StabilizationLP,
@@ -153,26 +156,35 @@ def iterate(
 
     Notes
     -----
-    Each step changes every control for which another one is better by a relative 1e-12, then sweeps
-    V <- T_u V for the new policy u, about as long as the improvement took; only a policy that seems
-    final is evaluated to the end. V >= T_u V stays true whatever the number of sweeps, so V falls
-    and every policy on the way is gamma-stabilizing (docs/mathematics.md, Policy iteration).
+    Each step changes every control for which another one is better by a relative 1e-12. Then the
+    new policy u is evaluated: to the end where few cells lie on cycles, else by sweeps
+    V <- T_u V, about as long as the improvement took; not at all after the first step, and every
+    second time where few controls changed. V >= T_u V stays true whatever the number of sweeps, so
+    V falls and every policy on the way is gamma-stabilizing (docs/mathematics.md, Policy
+    iteration); only a policy evaluated to the end is returned as the last.
     """
     screen = Screen(lp, gamma, cost)
     gamma, cost = screen.gamma, screen.cost
     rows: Peeled | None = None  # those of the policy at hand
     V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
+    hasty = False  # the policy at hand was not evaluated at all
     while True:
         out = stop() or step == limit
         done = screen.improve(V, pair, TIE) if not out else Pass(V, pair, 0, 0)
+        exact = None
         if done.changed:
             step += 1
-            x = done.value.copy()
-            sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
-            rows = peeled(lp, done.pair, gamma)
-            left = linear.advance(rows, cost[done.pair], x, sweeps, 0.1 * _fall(V, x), 0.0)
-            exact = x if left <= TOLERANCE else None
-            x = np.minimum(x, done.value)
+            x = done.value
+            hasty = not hasty and (step == 1 or done.changed * FEW < lp.n)
+            if hasty:
+                rows = None
+            else:
+                x = x.copy()
+                sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
+                rows = peeled(lp, done.pair, gamma)
+                left = linear.advance(rows, cost[done.pair], x, sweeps, 0.1 * _fall(V, x), 0.0)
+                exact = x if left <= TOLERANCE else None
+                x = np.minimum(x, done.value)
             screen.follow(V, x)
             pair, V = done.pair, x
         elif last is not None and last[0] is pair:
@@ -185,7 +197,7 @@ def iterate(
                 if exact is None:
                     exact = evaluate(lp, pair, gamma, cost, stop=stop)
             except Stopped:
-                exact = None
+                pass
             if exact is None:
                 return Iteration(*(last or (pair, V)), step, False, screen)
             screen.follow(V, np.minimum(exact, V))

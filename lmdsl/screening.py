@@ -24,6 +24,7 @@ Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 LEAST_SCALE = 1e-30
+MOST = np.float32(3e38)
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class Screen:
             )  # fmt: skip
             return int(changed), int(looked)
 
-        counts = bellman.over_cells(lp, part)
+        counts = bellman.over_cells(lp, part, bellman.IN_PLACE)
         return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
 
     def tied(
@@ -167,9 +168,10 @@ def _pass(  # type: ignore[no-untyped-def]
                     own_q += share[code[e]] * x[target[e]]
                 own_q = gamma * own_q + cost[own]
                 looked += 1
-                least[own] = min(own_q * store, 3e38)
+                least[own] = own_q * store if own_q * store < MOST else MOST
                 best = own_q
-                limit = min(limit, own_q * shrink)
+                if own_q * shrink < limit:
+                    limit = own_q * shrink
                 if least[k] >= limit:
                     continue
             q = 0.0
@@ -177,7 +179,7 @@ def _pass(  # type: ignore[no-untyped-def]
                 q += share[code[e]] * x[target[e]]
             q = gamma * q + cost[k]
             looked += 1
-            least[k] = min(q * store, 3e38)
+            least[k] = q * store if q * store < MOST else MOST
             if q < best:
                 best, choice, limit = q, k, q * shrink
         if choice != own and best < own_q - margin * abs(own_q):
@@ -185,11 +187,12 @@ def _pass(  # type: ignore[no-untyped-def]
             new[i] = choice
         else:
             best = own_q
-        x[i] = min(x[i], best)
-        smallest = np.float32(3e38)
+        if best < x[i]:
+            x[i] = best
+        smallest = MOST
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
-            if k != new[i]:
-                smallest = min(smallest, least[k])
+            if k != new[i] and least[k] < smallest:
+                smallest = least[k]
         rival[i] = smallest
     for i in range(first, last):
         value[i] = x[i]
