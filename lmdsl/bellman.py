@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TypeVar
 
 import numpy as np
@@ -58,9 +57,9 @@ def over_cells(
     The ranges, ``most`` at most, do not depend on the number of threads; nor do the results.
     """
     count = max(1, min(len(lp.rows.target) // GRAIN, most, lp.n))
-    ends = np.linspace(0, lp.n, count + 1).astype(np.int64).tolist()
-    ranges = list(pairwise(ends))
-    return [part(ranges[0])] if count == 1 else list(threads.in_order(part, ranges))
+    if count == 1:
+        return [part((0, lp.n))]
+    return list(threads.in_order(part, threads.ranges(lp.n, count)))
 
 
 def improve(

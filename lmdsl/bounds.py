@@ -26,7 +26,7 @@ Pairs = NDArray[np.int64]
 
 UNIT = 1.1 * 2.0**-53
 LEAST = 2.0**-1074
-MOST_EXACT_TERMS = 10_000
+MOST_EXACT_TERMS = 1_000
 MAX_EXACT = 20_000
 """Rows decided with exact rationals before giving up: about 0.4 s."""
 

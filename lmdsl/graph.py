@@ -18,7 +18,6 @@ visit per entry in all.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -170,8 +169,7 @@ def _tree(
     pair = np.full(cells, -1, dtype=np.int64)
     front = level == 0
     parts = 1 if len(rows.target) < SMALL else 8 * threads.count()
-    bounds = np.linspace(0, cells, parts + 1).astype(np.int64).tolist()
-    spans = list(itertools.pairwise(bounds))
+    spans = threads.ranges(cells, parts)
     left = 0 if before else PATIENCE * len(rows.target)
     below = 0
 

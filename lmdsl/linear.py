@@ -3,8 +3,9 @@
 For b >= 0 the smallest nonnegative solution is sum M^k b, finite for every b exactly when the
 spectral radius of M is below 1. The cells outside the core, most of them as a rule, are solved by
 substitution (peeling.py). On the core Gauss-Seidel sweeps converge, from any x >= 0, at least as
-fast as Jacobi's, and keep every iterate >= 0. Where they converge slowly the system is solved
-directly, class by class: the strongly connected classes of M are visited in an order in which
+fast as Jacobi's, and keep every iterate >= 0. Where they converge slowly and cells are many, a
+Krylov method makes a better guess. Where that does not help the system is solved directly, class by
+class: the strongly connected classes of M are visited in an order in which
 everything a class leads to is known, single cells by substitution, larger classes by sparse LU.
 Values may then span hundreds of decades, as a chain of slow classes makes them do, and each class
 is still solved to its own precision. Whether an answer is good enough is judged by the certificate.
@@ -21,7 +22,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl.peeling import Peeled
-from lmdsl.sweeps import CEILING, TOLERANCE, System
+from lmdsl.sweeps import CEILING, NEVER, TOLERANCE, System
 
 Floats = NDArray[np.float64]
 
@@ -29,6 +30,7 @@ TRIAL_SWEEPS = 60
 MAX_SWEEPS = 200_000
 MAX_FACTORED = 100_000
 DENSE = 50
+KRYLOV, KRYLOV_STEPS = 1000, 200
 PER_CORE = 20
 """The core may be swept more often than all cells, up to so many times."""
 
@@ -164,11 +166,22 @@ def _solve(
     stop: Stop,
 ) -> Floats | None:
     """Solve from a guess, which is overwritten, by sweeps or class by class."""
-    if (b == 0).any():
-        x[~_pays(system, b)] = 0.0  # exactly: a guess would only fade there
+    nothing = ~_pays(system, b) if (b == 0).any() else None
+    if nothing is not None:
+        x[nothing] = 0.0  # exactly: a guess would only fade there
     change, rate = _trial(system, b, x, enough, flat)
     if change <= enough:
         return x
+    guess = None
+    if len(b) >= KRYLOV and not _soon(change, rate):
+        guess = _krylov(system, b, x, stop)
+    if guess is not None:
+        x = guess
+        if nothing is not None:
+            x[nothing] = 0.0
+        change, rate = _trial(system, b, x, enough, flat)
+        if change <= enough:
+            return x
     if not _soon(change, rate):
         direct, small_enough = solve_by_class(matrix(), b, stop)
         if direct is not None or small_enough:
@@ -182,6 +195,39 @@ def _solve(
         if not np.isfinite(change) or x.max() > CEILING:
             return None
     return None
+
+
+def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
+    """Return a solution to about 12 digits of the largest, by BiCGSTAB, or None.
+
+    It takes one step for each mode that hinders sweeps, such as the slow escape from a well-mixed
+    set. A solution >= 0 is the right one: the left Perron vector of a class with spectral radius 1
+    or more contradicts x >= b + M x > 0 there.
+    """
+    from scipy.sparse.linalg import LinearOperator, bicgstab
+
+    known = system.inverse * b
+    if not known.max() < CEILING or system.inverse.max() >= NEVER:
+        return None
+    out = np.empty(len(b))
+
+    def rest(v: Floats) -> Floats:
+        _off_diagonal(system.begin, system.end, system.indices, system.data, v, out)
+        return v - system.inverse * out
+
+    def look(_: Floats) -> None:
+        if stop():
+            raise Stopped
+
+    operator = LinearOperator((len(b), len(b)), matvec=rest, dtype=np.float64)
+    start = x if x.max() < CEILING else None
+    with np.errstate(all="ignore"):
+        y, info = bicgstab(
+            operator, known, x0=start, rtol=1e-13, maxiter=KRYLOV_STEPS, callback=look
+        )
+    if info < 0 or not np.isfinite(y).all() or y.min() < -1e-9 * y.max():
+        return None
+    return np.maximum(y, b)
 
 
 def _pays(system: System, b: Floats) -> NDArray[np.bool_]:
@@ -284,6 +330,15 @@ def _factors(inner: Any) -> Callable[[Floats], Floats]:
 def _dense(inner: Any) -> Callable[[Floats], Floats]:
     system = np.eye(inner.shape[0]) - inner.toarray()
     return lambda known: np.linalg.solve(system, known)
+
+
+@njit(cache=True, nogil=True)
+def _off_diagonal(begin, end, indices, data, v, out):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(begin))):
+        y = 0.0
+        for e in range(begin[i], end[i]):
+            y += data[e] * v[indices[e]]
+        out[i] = y
 
 
 @njit(cache=True, nogil=True)

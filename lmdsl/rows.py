@@ -12,11 +12,10 @@ entry, 0 there. Every row sums to exactly 1 with it.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,9 @@ from numpy.typing import NDArray
 from lmdsl import threads
 from lmdsl.sampling import Nodes
 from lmdsl.sweeps import NEVER, ONE, SPLIT, System
+
+PARTS = 8
+"""Ranges into which many rows are split for threads."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ class Rows:
         """Return some of the rows, in the given order."""
         chosen = np.ascontiguousarray(rows, dtype=np.int64).view(np.uint64)
         pointer = np.zeros(len(chosen) + 1, dtype=np.int64)
-        spans = _spans(len(chosen))
+        spans = threads.ranges(len(chosen), PARTS if len(chosen) >= SPLIT else 1)
 
         def lengths(span: tuple[int, int]) -> None:
             _lengths(*span, chosen, self.kernel[0], pointer[1:])
@@ -139,11 +141,11 @@ class Rows:
         def copy(span: tuple[int, int]) -> None:
             _take(*span, chosen, *self.kernel[:3], pointer, target, code)
 
-        deque(threads.in_order(lengths, spans), maxlen=0)
+        _each(lengths, spans)
         np.cumsum(pointer, out=pointer)
         target = np.empty(int(pointer[-1]), dtype=np.int32)
         code = np.empty(int(pointer[-1]), dtype=self.code.dtype)
-        deque(threads.in_order(copy, spans), maxlen=0)
+        _each(copy, spans)
         return Rows(pointer, target, code, self.shares, self.columns)
 
     def system(self, rows: NDArray[np.int64], gamma: float) -> System:
@@ -152,7 +154,7 @@ class Rows:
         chosen, columns = rows.view(np.uint64), np.uint32(self.columns)
         begin, end = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
         inverse = np.empty(count)
-        spans = _spans(count)
+        spans = threads.ranges(count, PARTS if count >= SPLIT else 1)
 
         def lengths(span: tuple[int, int]) -> None:
             _lengths(*span, chosen, self.kernel[0], end)
@@ -162,12 +164,12 @@ class Rows:
                 *span, chosen, *self.kernel, columns, gamma, begin, end, indices, data, inverse
             )
 
-        deque(threads.in_order(lengths, spans), maxlen=0)
+        _each(lengths, spans)
         begin[:1] = 0
         np.cumsum(end[:-1], out=begin[1:])
         entries = int(begin[-1] + end[-1]) if count else 0
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
-        deque(threads.in_order(fill, spans), maxlen=0)
+        _each(fill, spans)
         return System(begin, end, indices, data, inverse)
 
     def matrix(self, rows: NDArray[np.integer] | None = None):  # type: ignore[no-untyped-def]
@@ -194,10 +196,8 @@ class Rows:
         return matrix
 
 
-def _spans(count: int) -> list[tuple[int, int]]:
-    """Split rows among threads where there are many; the parts do not depend on the threads."""
-    parts = 8 if count >= SPLIT else 1
-    return list(pairwise(np.linspace(0, count, parts + 1).astype(np.int64).tolist()))
+def _each(work: Callable[[tuple[int, int]], None], spans: list[tuple[int, int]]) -> None:
+    deque(map(work, spans) if len(spans) == 1 else threads.in_order(work, spans), maxlen=0)
 
 
 @njit(cache=True, nogil=True)

@@ -28,6 +28,11 @@ def count() -> int:
     return max(1, min(processors, int(config.NUMBA_NUM_THREADS)))
 
 
+def ranges(total: int, count: int) -> list[tuple[int, int]]:
+    """Split ``range(total)`` into ranges of nearly equal length."""
+    return [(total * k // count, total * (k + 1) // count) for k in range(count)]
+
+
 def in_order(work: Callable[[Part], Outcome], parts: Iterable[Part]) -> Iterator[Outcome]:
     """Yield ``work(part)`` for every part, in order, computed ahead by a few parts.
 

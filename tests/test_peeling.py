@@ -8,6 +8,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import spsolve
 
 from lmdsl import linear
 from lmdsl.peeling import Peeled
@@ -110,3 +111,29 @@ def test_a_growing_cycle_has_no_solution():
     peeled = Peeled.of(System.of(M))
     assert list(peeled.core) == [0, 1]
     assert not linear.solve_from(peeled, np.ones(3), np.ones(3), lambda: M)
+
+
+def well_mixed(n, escape):
+    """Return a matrix whose sweeps are slow for one reason only: mass hardly escapes."""
+    rng = np.random.default_rng(n)
+    rows = np.repeat(np.arange(n), 4)
+    M = sp.csr_array((np.full(4 * n, 0.25), (rows, rng.integers(0, n, 4 * n))), shape=(n, n))
+    return M * (1 - escape)
+
+
+@pytest.mark.parametrize("zeros", [False, True])
+def test_well_mixed_systems_are_solved_without_factors(monkeypatch, zeros):
+    M = well_mixed(1200, 1e-3)
+    b = np.random.default_rng(1).random(1200)
+    if zeros:
+        b[100:] = 0.0
+    exact = spsolve(sp.eye_array(1200, format="csc") - M.tocsc(), b)
+    monkeypatch.setattr(linear, "solve_by_class", lambda *_: pytest.fail("it was factored"))
+    np.testing.assert_allclose(linear.solve(M, b), exact, rtol=1e-9)
+    mu = linear.solve_transposed(Peeled.of(System.of(M)), b, lambda: M)
+    np.testing.assert_allclose(mu - M.T @ mu, b, atol=1e-11 * mu.max())
+
+
+def test_a_well_mixed_system_that_grows_has_no_solution():
+    M = well_mixed(1100, -1e-3)
+    assert linear.solve(M, np.ones(1100)) is None
