@@ -117,19 +117,23 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
     return Improvement(value, pair)
 
 
-def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDArray[np.bool_]:
-    """Return the columns with Q <= Q_min + tolerance |Q_min|, shape (K,)."""
-    ties = np.empty(lp.K, dtype=np.bool_)
-    x, limit = padded(V), best + tolerance * np.abs(best)
+def below(lp: StabilizationLP, V: Floats, limit: Floats) -> NDArray[np.bool_]:
+    """Return the columns with Q <= limit at V, shape (K,); ``limit`` has shape (n,)."""
+    found, x = np.empty(lp.K, dtype=np.bool_), padded(V)
 
     def part(cells: tuple[int, int]) -> None:
-        _tied(
+        _below(
             *cells, *lp.kernel,
-            lp.cost, lp.gamma, x, limit, ties,
+            lp.cost, lp.gamma, x, limit, found,
         )  # fmt: skip
 
     over_cells(lp, part)
-    return ties
+    return found
+
+
+def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDArray[np.bool_]:
+    """Return the columns with Q <= Q_min + tolerance |Q_min|, shape (K,)."""
+    return below(lp, V, best + tolerance * np.abs(best))
 
 
 @njit(cache=True, nogil=True)
@@ -149,15 +153,15 @@ def _improve(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _tied(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, limit, ties
+def _below(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, limit, found
 ):
     for i in range(np.uint64(first), np.uint64(last)):
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             q = 0.0
             for e in range(pointer[k], pointer[k + ONE]):
                 q += share[code[e]] * V[target[e]]
-            ties[k] = gamma * q + cost[k] <= limit[i]
+            found[k] = gamma * q + cost[k] <= limit[i]
 
 
 @njit(cache=True, nogil=True)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import backends, bellman, certificate, feasibility, gamma, policy
+from lmdsl import backends, bellman, certificate, elimination, feasibility, gamma, policy
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.scaled import failure
 from lmdsl.certificate import Certificate, Verified, Witness
@@ -190,21 +190,45 @@ class _Outcome:
 
 def _asked(lp: StabilizationLP, backend: Backend, options: Options) -> Solution:
     """Ask a backend; whatever it raises or returns, a well-formed solution comes out."""
+    asked, kept = lp, None
     try:
-        solution = backend.solve(lp, options)
+        if backend.capabilities.elimination and options.start is not None:
+            kept, options = _without_suboptimal(lp, options)
+            asked = lp.part(kept, np.arange(lp.n))
+        solution = backend.solve(asked, options)
     except BadInput:
         raise
     except BaseException as error:  # solvers written in Rust panic outside Exception
         return failure(error)
     if not isinstance(solution, Solution) or not isinstance(solution.stop, Stop):
         return Solution(Stop.FAILED, "the backend returned no Solution")
+    occupation, pair = _vector(solution.occupation, asked.K), _policy(asked, solution.pair)
+    if kept is not None:
+        pair = None if pair is None else kept[pair]
+        if occupation is not None:
+            spread = np.zeros(lp.K)
+            spread[kept] = occupation
+            occupation = spread
     return replace(
         solution,
         word=str(solution.word)[:200],
         value=_vector(solution.value, lp.n),
-        occupation=_vector(solution.occupation, lp.K),
-        pair=_policy(lp, solution.pair),
+        occupation=occupation,
+        pair=pair,
     )
+
+
+def _without_suboptimal(lp: StabilizationLP, options: Options) -> tuple[Pairs, Options]:
+    """Return the columns worth solving for, and the options for a model of these alone."""
+    started, limit, start = time.monotonic(), options.time_limit, options.start
+    assert start is not None
+
+    def late() -> bool:
+        return limit is not None and time.monotonic() - started > limit
+
+    kept = elimination.survivors(lp, start, options.proof, late)
+    left = None if limit is None else max(limit - (time.monotonic() - started), 1e-9)
+    return kept, replace(options, time_limit=left, start=np.searchsorted(kept, start))
 
 
 def _vector(values: Any, count: int) -> Any:

@@ -44,7 +44,7 @@ bellman rational
 screening
 bounds
 policy growth
-feasibility
+feasibility elimination
 gamma
 backends.base
 backends.scaled

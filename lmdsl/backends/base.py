@@ -62,6 +62,8 @@ class Capabilities:
         It can return a certificate of infeasibility.
     warm_start
         It makes use of ``Options.start``.
+    elimination
+        It is given only the columns that may belong to an optimal policy (elimination.py).
     tolerance, time_limit, iteration_limit
         It respects these options.
     """
@@ -70,6 +72,7 @@ class Capabilities:
     vertex: bool = False
     rays: bool = False
     warm_start: bool = False
+    elimination: bool = False
     tolerance: bool = True
     time_limit: bool = True
     iteration_limit: bool = True

@@ -112,4 +112,6 @@ def _stop(word: str, iterations: int, most: int, late: bool) -> Stop:
     return stop
 
 
-BACKEND = Backend("clarabel", solve, Capabilities(algorithms=tuple(ALGORITHMS)), ("clarabel",))
+BACKEND = Backend(
+    "clarabel", solve, Capabilities(algorithms=tuple(ALGORITHMS), elimination=True), ("clarabel",)
+)

@@ -155,4 +155,4 @@ def _stop(status: str, solver: str, iterations: int | None, most: int | None, la
     return stop
 
 
-BACKEND = Backend("cvxpy", solve, Capabilities(algorithms=()), ("cvxpy",))
+BACKEND = Backend("cvxpy", solve, Capabilities(elimination=True), ("cvxpy",))

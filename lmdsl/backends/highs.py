@@ -141,6 +141,6 @@ def _model(highspy: Any, scaled: ScaledLP) -> Any:
 BACKEND = Backend(
     "highs",
     solve,
-    Capabilities(algorithms=tuple(ALGORITHMS), extras={"hipo": "highspy-extras"}),
+    Capabilities(algorithms=tuple(ALGORITHMS), extras={"hipo": "highspy-extras"}, elimination=True),
     ("highspy",),
 )
