@@ -22,6 +22,7 @@ from lmdsl.linear import Stop as Stop
 from lmdsl.linear import Stopped, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.peeling import Peeled
+from lmdsl.rows import Slots
 from lmdsl.screening import Pass, Screen
 from lmdsl.sweeps import CEILING, ONE, TOLERANCE
 
@@ -165,6 +166,7 @@ def iterate(
     """
     screen = Screen(lp, gamma, cost)
     gamma, cost = screen.gamma, screen.cost
+    slots = Slots.of(lp.rows, lp.pair_pointer, gamma)
     rows: Peeled | None = None  # those of the policy at hand
     V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
     hasty = False  # the policy at hand was not evaluated at all
@@ -181,7 +183,7 @@ def iterate(
             else:
                 x = x.copy()
                 sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
-                rows = peeled(lp, done.pair, gamma)
+                rows = Peeled.of(slots.system(done.pair))
                 left = linear.advance(rows, cost[done.pair], x, sweeps, 0.1 * _fall(V, x), 0.0)
                 exact = x if left <= TOLERANCE else None
                 x = np.minimum(x, done.value)
@@ -191,9 +193,8 @@ def iterate(
             return Iteration(*last, step, not out, screen)
         else:
             try:
-                exact = evaluate(
-                    lp, pair, gamma, cost, done.value, transient=True, stop=stop, rows=rows
-                )
+                rows = rows or Peeled.of(slots.system(pair))
+                exact = evaluate(lp, pair, gamma, cost, done.value, True, stop, rows)
                 if exact is None:
                     exact = evaluate(lp, pair, gamma, cost, stop=stop)
             except Stopped:

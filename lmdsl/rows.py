@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from lmdsl import threads
 from lmdsl.sampling import Nodes
-from lmdsl.sweeps import NEVER, ONE, SPLIT, System
+from lmdsl.sweeps import NEVER, ONE, System
 
-PARTS = 8
-"""Ranges into which many rows are split for threads."""
+PARTS, MANY = 8, 10_000
+"""Ranges into which rows are split for threads, and how many rows are worth it."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Rows:
         """Return some of the rows, in the given order."""
         chosen = np.ascontiguousarray(rows, dtype=np.int64).view(np.uint64)
         pointer = np.zeros(len(chosen) + 1, dtype=np.int64)
-        spans = threads.ranges(len(chosen), PARTS if len(chosen) >= SPLIT else 1)
+        spans = _spans(len(chosen))
 
         def lengths(span: tuple[int, int]) -> None:
             _lengths(*span, chosen, self.kernel[0], pointer[1:])
@@ -150,27 +150,7 @@ class Rows:
 
     def system(self, rows: NDArray[np.int64], gamma: float) -> System:
         """Return gamma P for one row per column, ready for sweeps."""
-        count = len(rows)
-        chosen, columns = rows.view(np.uint64), np.uint32(self.columns)
-        begin, end = np.empty(count, dtype=np.uint64), np.empty(count, dtype=np.uint64)
-        inverse = np.empty(count)
-        spans = threads.ranges(count, PARTS if count >= SPLIT else 1)
-
-        def lengths(span: tuple[int, int]) -> None:
-            _lengths(*span, chosen, self.kernel[0], end)
-
-        def fill(span: tuple[int, int]) -> None:
-            _gather_split(
-                *span, chosen, *self.kernel, columns, gamma, begin, end, indices, data, inverse
-            )
-
-        _each(lengths, spans)
-        begin[:1] = 0
-        np.cumsum(end[:-1], out=begin[1:])
-        entries = int(begin[-1] + end[-1]) if count else 0
-        indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
-        _each(fill, spans)
-        return System(begin, end, indices, data, inverse)
+        return Slots(self, self.pointer[rows + 1] - self.pointer[rows], gamma).system(rows)
 
     def matrix(self, rows: NDArray[np.integer] | None = None):  # type: ignore[no-untyped-def]
         """Return rows as a SciPy CSR array of doubles, shape (len(rows), columns).
@@ -196,6 +176,63 @@ class Rows:
         return matrix
 
 
+class Slots:
+    """Room for the system of a policy: as the policy changes, only the rows that differ are copied.
+
+    Parameters
+    ----------
+    rows
+        The rows of all pairs.
+    room
+        Largest number of entries that the row of each cell may have, shape (n,).
+    gamma
+        Weight of the rows.
+    """
+
+    def __init__(self, rows: Rows, room: NDArray[np.int64], gamma: float) -> None:
+        self.rows, self.gamma = rows, gamma
+        ends = np.cumsum(room)
+        count, entries = len(room), int(ends[-1]) if len(room) else 0
+        self.chosen = np.full(count, -1, dtype=np.int64)
+        self.held = System(
+            (ends - room).view(np.uint64),
+            np.empty(count, dtype=np.uint64),
+            np.empty(entries, dtype=np.uint32),
+            np.empty(entries),
+            np.empty(count),
+        )
+
+    @classmethod
+    def of(cls, rows: Rows, pair_pointer: NDArray[np.int64], gamma: float) -> Slots:
+        """Make room for any policy, a pair of each cell's own."""
+        room = np.empty(len(pair_pointer) - 1, dtype=np.int64)
+
+        def longest(span: tuple[int, int]) -> None:
+            _longest(*span, pair_pointer.view(np.uint64), rows.kernel[0], room)
+
+        _each(longest, _spans(len(room)))
+        return cls(rows, room, gamma)
+
+    def system(self, chosen: NDArray[np.int64]) -> System:
+        """Return gamma P for one row of each cell; it holds until the next call."""
+        s, columns = self.held, np.uint32(self.rows.columns)
+        now, before = chosen.view(np.uint64), self.chosen.view(np.uint64)
+
+        def fill(span: tuple[int, int]) -> None:
+            _fill(
+                *span, now, before, *self.rows.kernel, columns, self.gamma,
+                s.begin, s.end, s.indices, s.data, s.inverse,
+            )  # fmt: skip
+
+        _each(fill, _spans(len(chosen)))
+        self.chosen = chosen.copy()
+        return s
+
+
+def _spans(count: int) -> list[tuple[int, int]]:
+    return threads.ranges(count, PARTS if count >= MANY else 1)
+
+
 def _each(work: Callable[[tuple[int, int]], None], spans: list[tuple[int, int]]) -> None:
     deque(map(work, spans) if len(spans) == 1 else threads.in_order(work, spans), maxlen=0)
 
@@ -216,13 +253,25 @@ def _lengths(first, last, rows, pointer, length):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True, nogil=True)
-def _gather_split(  # type: ignore[no-untyped-def]
-    first, last, rows, pointer, target, code, share, columns, gamma, begin, end, indices, data,
-    inverse,
+def _longest(first, last, pair_pointer, pointer, room):  # type: ignore[no-untyped-def]
+    """Find the largest number of entries among the rows of each cell."""
+    for i in range(np.uint64(first), np.uint64(last)):
+        most = np.uint64(0)
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
+            most = max(most, pointer[k + ONE] - pointer[k])
+        room[i] = most
+
+
+@njit(cache=True, nogil=True)
+def _fill(  # type: ignore[no-untyped-def]
+    first, last, rows, before, pointer, target, code, share, columns, gamma, begin, end, indices,
+    data, inverse,
 ):  # fmt: skip
     """Copy rows without the attractor's share and without the diagonal, which is solved for."""
     for r in range(np.uint64(first), np.uint64(last)):
         own, k, used = 0.0, rows[r], begin[r]
+        if k == before[r]:
+            continue
         for e in range(pointer[k], pointer[k + ONE]):
             j = target[e]
             if j == r:

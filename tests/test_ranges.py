@@ -17,7 +17,7 @@ def test_ranges_and_halves_give_the_same_policy(monkeypatch, workers):
     whole = lm.solve(problem)
     monkeypatch.setattr(bellman, "GRAIN", 1)
     monkeypatch.setattr(sweeps, "SPLIT", 1)
-    monkeypatch.setattr(rows, "SPLIT", 1)
+    monkeypatch.setattr(rows, "MANY", 1)
     monkeypatch.setattr(threads, "count", lambda: workers)
     parts = lm.solve(problem)
     assert parts.status == whole.status == "verified"
