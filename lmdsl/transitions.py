@@ -68,21 +68,27 @@ ALL_ADMISSIBLE = Pilot()
 
 
 def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
-    """Return the bytes that compiling a problem takes at its peak."""
+    """Return the bytes that compiling and solving a problem takes at its peak.
+
+    Solving is counted for the default backend.
+    """
     # Capped: a stranger's product of counts may exceed the range of doubles.
     N = min(math.prod(axis.cells for axis in problem.state_box.values()), 10**40)
     M = min(sampling.control_count(problem), 10**40)
     S = min(sampling.sample_points(problem) * sampling.node_count(problem), 10**40)
-    code = 1 if S <= 2**8 else 2 if S <= 2**16 else 4
-    # Of a pair the row's end, control, cost and whether it survives; of a cell the regions,
-    # levels and weights.
-    per_pair = 21 + pilot.entries * (4 + code)
-    if pilot.admissible < 1:  # cells may be lost: the model is copied without them
-        per_pair += 28 + pilot.entries * (4 + code)
-    grids = M * 8 * (1 + len(problem.control_grid)) + S * (8 * len(problem.state_box) + 200)
+    entry = 4 + (1 if S <= 2**8 else 2 if S <= 2**16 else 4)
+    pairs = M * pilot.admissible
+    # Of a pair the row, its end, control and cost; of a cell the regions, levels and weights.
+    model = N * (64 + pairs * (21 + pilot.entries * entry))
+    copied = (
+        pairs * (28 + pilot.entries * entry) if pilot.admissible < 1 else 0
+    )  # cells may be lost
     # Samples and images of every axis, and the intermediate arrays of a formula.
-    temporaries = (2 * len(problem.state_box) + 10) * 8 * max(CHUNK, S) * threads.count()
-    return int(min(N * (64 + M * pilot.admissible * per_pair) + grids + temporaries, 1e30))
+    blocks = (2 * len(problem.state_box) + 10) * 8 * max(CHUNK, S) * threads.count()
+    # Of a pair a bound of its Q; of a cell vectors, and the rows of a policy in doubles.
+    solving = pairs * 5 + 120 + 24 * pilot.entries
+    grids = M * 8 * (1 + len(problem.control_grid)) + S * (8 * len(problem.state_box) + 200)
+    return int(min(model + max(N * copied + blocks, N * solving) + grids, 1e30))
 
 
 def assemble(

@@ -53,21 +53,27 @@ def certify(
     value, w
         Guesses of the policy's value and its unit-cost value; made where missing.
     """
+    witness, V = _first_try(lp, pair, tolerance, value, w)
+    proof = check(lp, witness, tolerance)
+    if V is not None and (proof.gap is None or proof.gap > tolerance):
+        witness = _tightened(lp, witness, V, tolerance)
+        proof = check(lp, witness, tolerance)
+    return Verified(proof, witness)
+
+
+def _first_try(
+    lp: StabilizationLP, pair: Pairs, tolerance: float, value: Floats | None, w: Floats | None
+) -> tuple[Witness, Floats | None]:
+    """Return vectors that serve as a rule, and the policy's value."""
     under, own = lp.under(pair), np.arange(lp.n)
     rows = policy.peeled(under, own, lp.gamma)
     growing = rows if lp.growth == lp.gamma else None
     w, d = policy.stability_vector(under, own, w, sharp=True, rows=growing)
     V = policy.evaluate(under, own, start=value, transient=w is not None, rows=rows)
     if V is None:
-        witness = Witness(pair, w, None, lower_vector(lp, None, tolerance), None)
-        return Verified(check(lp, witness, tolerance), witness)
-    V_up, mu = upper_vector(under, own, V, w, d), _measure_vector(under, rows)
-    witness = Witness(pair, w, V_up, _guessed(under, V, tolerance), mu)
-    proof = check(lp, witness, tolerance)
-    if proof.gap is None or proof.gap > tolerance:
-        witness = _tightened(lp, witness, V, tolerance)
-        proof = check(lp, witness, tolerance)
-    return Verified(proof, witness)
+        return Witness(pair, w, None, lower_vector(lp, None, tolerance), None), None
+    V_up, W = upper_vector(under, own, V, w, d), _guessed(under, V, tolerance)
+    return Witness(pair, w, V_up, W, _measure_vector(under, rows)), V
 
 
 def _tightened(lp: StabilizationLP, witness: Witness, V: Floats, tolerance: float) -> Witness:
