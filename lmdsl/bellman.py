@@ -59,7 +59,7 @@ def over_cells(
     count = max(1, min(len(lp.rows.target) // GRAIN, most, lp.n))
     if count == 1:
         return [part((0, lp.n))]
-    return list(threads.in_order(part, threads.ranges(lp.n, count)))
+    return threads.each(part, threads.ranges(lp.n, count))
 
 
 def improve(

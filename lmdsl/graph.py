@@ -179,7 +179,7 @@ def _tree(
         )
 
     while left > 0 and front.any():
-        left -= sum(map(sweep, spans) if parts == 1 else threads.in_order(sweep, spans))
+        left -= sum(threads.each(sweep, spans))
         below += 1
         np.equal(level, below, out=front)
     if front.any():

@@ -11,8 +11,7 @@ entry, 0 there. Every row sums to exactly 1 with it.
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -141,11 +140,11 @@ class Rows:
         def copy(span: tuple[int, int]) -> None:
             _take(*span, chosen, *self.kernel[:3], pointer, target, code)
 
-        _each(lengths, spans)
+        threads.each(lengths, spans)
         np.cumsum(pointer, out=pointer)
         target = np.empty(int(pointer[-1]), dtype=np.int32)
         code = np.empty(int(pointer[-1]), dtype=self.code.dtype)
-        _each(copy, spans)
+        threads.each(copy, spans)
         return Rows(pointer, target, code, self.shares, self.columns)
 
     def system(self, rows: NDArray[np.int64], gamma: float) -> System:
@@ -210,7 +209,7 @@ class Slots:
         def longest(span: tuple[int, int]) -> None:
             _longest(*span, pair_pointer.view(np.uint64), rows.kernel[0], room)
 
-        _each(longest, _spans(len(room)))
+        threads.each(longest, _spans(len(room)))
         return cls(rows, room, gamma)
 
     def system(self, chosen: NDArray[np.int64]) -> System:
@@ -224,17 +223,13 @@ class Slots:
                 s.begin, s.end, s.indices, s.data, s.inverse,
             )  # fmt: skip
 
-        _each(fill, _spans(len(chosen)))
+        threads.each(fill, _spans(len(chosen)))
         self.chosen = chosen.copy()
         return s
 
 
 def _spans(count: int) -> list[tuple[int, int]]:
     return threads.ranges(count, PARTS if count >= MANY else 1)
-
-
-def _each(work: Callable[[tuple[int, int]], None], spans: list[tuple[int, int]]) -> None:
-    deque(map(work, spans) if len(spans) == 1 else threads.in_order(work, spans), maxlen=0)
 
 
 @njit(cache=True, nogil=True)

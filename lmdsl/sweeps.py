@@ -5,7 +5,6 @@ Staying put is summed up at once: x_i = (b_i + sum over j != i of M_ij x_j) / (1
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -188,24 +187,23 @@ def _in_halves(
             b, old, new, sweep % 2 == 1, measured, highest,
         )  # fmt: skip
 
-    with ThreadPoolExecutor(min(threads.count(), 2)) as pool:
-        for sweep in range(count):
-            measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
-            now, then = then, now
-            tasks = [(*ends, sweep, measured, top, now, then) for ends in halves]
-            found = list(pool.map(half, tasks))
-            if not measured:
-                continue
-            change, most, top = (max(part[k] for part in found) for k in range(3))
-            if not top < CEILING:
-                change = np.inf
-                break
-            if sweep == count // 2:
-                halfway = change
-            if change <= enough:
-                break
-            if most <= flat:
-                change = 0.0
-                break
+    for sweep in range(count):
+        measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
+        now, then = then, now
+        tasks = [(*ends, sweep, measured, top, now, then) for ends in halves]
+        found = threads.each(half, tasks)
+        if not measured:
+            continue
+        change, most, top = (max(part[k] for part in found) for k in range(3))
+        if not top < CEILING:
+            change = np.inf
+            break
+        if sweep == count // 2:
+            halfway = change
+        if change <= enough:
+            break
+        if most <= flat:
+            change = 0.0
+            break
     x[:] = then
     return halfway, change

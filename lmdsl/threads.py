@@ -8,15 +8,21 @@ The environment variable ``NUMBA_NUM_THREADS`` limits their number.
 from __future__ import annotations
 
 import os
+import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import TypeVar
 
 from numba import config
 
 Part = TypeVar("Part")
 Outcome = TypeVar("Outcome")
+
+_pool: ThreadPoolExecutor | None = None
+_members = 0
+_making = threading.Lock()
+_inside = threading.local()
 
 
 def count() -> int:
@@ -33,17 +39,60 @@ def ranges(total: int, count: int) -> list[tuple[int, int]]:
     return [(total * k // count, total * (k + 1) // count) for k in range(count)]
 
 
+def each(work: Callable[[Part], Outcome], parts: Sequence[Part]) -> list[Outcome]:
+    """Return ``[work(part) for part in parts]``.
+
+    Every thread takes the next part as soon as it has finished one; the calling thread works too.
+    Of several errors that of the first part is raised, when the parts begun have ended.
+    """
+    helpers = min(_helpers(), len(parts) - 1)
+    if helpers < 1:
+        return [work(part) for part in parts]
+    outcomes: dict[int, Outcome] = {}
+    errors: dict[int, Exception] = {}
+    left, lock = iter(range(len(parts))), threading.Lock()
+
+    def take() -> int | None:
+        with lock:
+            return next(left, None)
+
+    def pull() -> None:
+        while (k := take()) is not None:
+            try:
+                outcomes[k] = work(parts[k])
+            except Exception as error:
+                errors[k] = error
+                drop()
+
+    def drop() -> None:
+        with lock:
+            deque(left, maxlen=0)
+
+    pool = _shared(helpers)
+    others = [pool.submit(pull) for _ in range(helpers)]
+    try:
+        pull()
+    finally:
+        drop()
+        for other in others:
+            other.cancel()  # one that has not begun has nothing left to do
+        wait(others)
+    if errors:
+        raise errors[min(errors)]
+    return [outcomes[k] for k in range(len(parts))]
+
+
 def in_order(work: Callable[[Part], Outcome], parts: Iterable[Part]) -> Iterator[Outcome]:
-    """Yield ``work(part)`` for every part, in order, computed ahead by a few parts.
+    """Yield ``work(part)`` for every part of a long series, in order, a few parts ahead.
 
     The calling thread works too. The first part that raises ends the iteration with its error;
     the parts begun are waited for, the others never begin.
     """
-    helpers = count() - 1
+    helpers = _helpers()
     if not helpers:
         yield from map(work, parts)
         return
-    pool = ThreadPoolExecutor(helpers)
+    pool = _shared(helpers)
     ahead: deque[Future[Outcome]] = deque()
     try:
         for part in parts:
@@ -56,7 +105,9 @@ def in_order(work: Callable[[Part], Outcome], parts: Iterable[Part]) -> Iterator
         while ahead:
             yield ahead.popleft().result()
     finally:
-        pool.shutdown(cancel_futures=True)
+        for future in ahead:
+            future.cancel()
+        wait(ahead)
 
 
 def _done(work: Callable[[Part], Outcome], part: Part) -> Future[Outcome]:
@@ -67,3 +118,31 @@ def _done(work: Callable[[Part], Outcome], part: Part) -> Future[Outcome]:
     except Exception as error:
         future.set_exception(error)
     return future
+
+
+def _helpers() -> int:
+    """Return how many other threads may help; none helps a helper, or all might wait for all."""
+    return 0 if getattr(_inside, "helping", False) else count() - 1
+
+
+def _shared(helpers: int) -> ThreadPoolExecutor:
+    """Return a pool of at least so many threads; starting them anew costs as much as their work."""
+    global _pool, _members
+    with _making:
+        if _pool is None or _members < helpers:  # one that is dropped ends when nobody uses it
+            _pool, _members = ThreadPoolExecutor(helpers, initializer=_begin), helpers
+        return _pool
+
+
+def _begin() -> None:
+    _inside.helping = True
+
+
+def _forget() -> None:
+    """Threads do not survive a fork."""
+    global _pool, _members, _making
+    _pool, _members, _making = None, 0, threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)

@@ -1,6 +1,8 @@
 """The assembly kernels against plain references, and independence of blocks and threads."""
 
 import math
+import os
+import time
 from collections import Counter
 
 import numpy as np
@@ -140,6 +142,47 @@ def test_rows_do_not_depend_on_the_number_of_threads(monkeypatch):
         monkeypatch.setattr(sampler, "CHUNK", 3000)
         digests.add(lm.compile(made(standard_map(20))).digest)
     assert len(digests) == 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 7])
+def test_each_part_is_worked_on_once(monkeypatch, count):
+    monkeypatch.setattr(threads, "count", lambda: count)
+    for total in (0, 1, 2, 50):
+        parts = threads.ranges(100, total) if total else []
+        assert [k for first, last in parts for k in range(first, last)] == list(
+            range(100 if total else 0)
+        )
+        assert threads.each(lambda part: part, parts) == parts
+
+    def work(x):
+        if x in (20, 21, 40):
+            raise ValueError(str(x))
+        return threads.each(lambda y: x + y, range(3))  # helpers do not wait for helpers
+
+    assert threads.each(work, range(20)) == [[x, x + 1, x + 2] for x in range(20)]
+    with pytest.raises(ValueError, match="20"):
+        threads.each(work, range(50))
+    assert threads.each(abs, [-1, -2]) == [1, 2]  # and goes on after an error
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_threads_work_after_a_fork(monkeypatch):
+    monkeypatch.setattr(threads, "count", lambda: 2)
+    assert threads.each(abs, range(8)) == list(range(8))
+    child = os.fork()
+    if not child:
+        os._exit(0 if threads.each(abs, range(8)) == list(range(8)) else 1)
+    for _ in range(200):
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            break
+        time.sleep(0.05)
+    else:
+        os.kill(child, 9)
+        os.waitpid(child, 0)
+        pytest.fail("the child waits for threads it does not have")
+    assert status == 0
 
 
 @pytest.mark.parametrize("count", [1, 2, 7])
