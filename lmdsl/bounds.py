@@ -61,7 +61,7 @@ def decrease(lp: StabilizationLP, pair: Pairs, w: Floats, g: float) -> Floats | 
 
     It proves that the spectral radius of g P_u is at most 1 - min d/w < 1.
     """
-    if not (np.isfinite(w).all() and (w > 0).all()):
+    if w.shape != (lp.n,) or not (np.isfinite(w).all() and (w > 0).all()):
         return None
     d = (w - expected_above(lp, pair, w, g)) * (1 - 4 * UNIT)
     return d if (d > 0).all() else None
@@ -187,7 +187,8 @@ def total_above(values: Floats) -> float:
     if len(values) <= MOST_EXACT_TERMS:
         return total(values) * (1 + 4 * UNIT)
     # NumPy adds pairwise: fewer than 64 roundings deep.
-    return float(values.sum()) * (1 + 70 * UNIT)
+    with np.errstate(over="ignore"):
+        return float(values.sum()) * (1 + 70 * UNIT)
 
 
 def weighted(weight: Floats, values: Floats, direction: float) -> float:
@@ -202,11 +203,15 @@ def weighted(weight: Floats, values: Floats, direction: float) -> float:
             rough = total(weight * values)
         return rough * (1 + math.copysign(4 * UNIT, direction))
     product = weight * values
-    if len(product) > MOST_EXACT_TERMS:
+    on = (weight > 0) & (values > 0)
+    count = int(np.count_nonzero(on))
+    if not count:
+        return 0.0
+    if len(product) > MOST_EXACT_TERMS or product[on].min() < 1e-250:  # no longer split exactly
         # NumPy adds pairwise: fewer than 64 roundings deep, one more for each product.
         near = float(product.sum())
-        slack = 70 * UNIT * near + len(product) * LEAST
-        return float(np.nextafter(near + math.copysign(slack, direction), direction))
+        slack = 70 * UNIT * near + count * LEAST
+        return max(float(np.nextafter(near + math.copysign(slack, direction), direction)), 0.0)
     a, b = _halves(weight), _halves(values)
     error = ((a[0] * b[0] - product) + a[0] * b[1] + a[1] * b[0]) + a[1] * b[1]
     terms = [*product.tolist(), *error.tolist()]

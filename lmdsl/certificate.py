@@ -121,7 +121,7 @@ def check_stabilizing(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | No
 
 def check_upper(lp: StabilizationLP, pair: Pairs, V_up: Floats) -> bool:
     """Claim 2: V_up >= gamma P_u V_up + G_u and V_up >= 0."""
-    if not (np.isfinite(V_up).all() and (V_up >= 0).all()):
+    if V_up.shape != (lp.n,) or not (np.isfinite(V_up).all() and (V_up >= 0).all()):
         return False
     future = bounds.expected_above(lp, pair, V_up, lp.gamma)
     return bool((V_up >= bounds.add_above(future, lp.cost[pair])).all())
@@ -129,7 +129,7 @@ def check_upper(lp: StabilizationLP, pair: Pairs, V_up: Floats) -> bool:
 
 def check_lower(lp: StabilizationLP, W: Floats) -> bool:
     """Claim 3: W <= gamma P_a W + G_a for every surviving pair."""
-    if not (np.isfinite(W).all() and (W >= 0).all()):
+    if W.shape != (lp.n,) or not (np.isfinite(W).all() and (W >= 0).all()):
         return False
     return bounds.holds_for_all(lp, W, lp.gamma, lp.cost)
 
@@ -140,7 +140,7 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
     Where the rounding of a large measure alone exceeds the tolerance, small models are summed
     exactly.
     """
-    if not (np.isfinite(mu).all() and (mu >= 0).all()):
+    if mu.shape != (lp.n,) or not (np.isfinite(mu).all() and (mu >= 0).all()):
         return math.inf
     with np.errstate(over="ignore", invalid="ignore"):
         inflow, relative, absolute = bounds.inflow(lp, pair, mu, lp.gamma)
@@ -161,7 +161,7 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
 
 def check_refusal(lp: StabilizationLP, w: Floats) -> bool:
     """Claim 6: w >= 0, w != 0 and w <= gamma P_a w for every surviving pair."""
-    if not (np.isfinite(w).all() and (w >= 0).all() and (w > 0).any()):
+    if w.shape != (lp.n,) or not (np.isfinite(w).all() and (w >= 0).all() and (w > 0).any()):
         return False
     return bounds.holds_for_all(lp, w, lp.gamma, None)
 

@@ -152,6 +152,9 @@ def tree(
 PATIENCE = 8
 """Visits per entry that sweeps may cost before predecessors are made: these cost about as much."""
 
+PARTS = 16
+"""Ranges of cells that threads work on."""
+
 SMALL = 2**20
 """Entries of rows below which one thread is fastest."""
 
@@ -168,7 +171,7 @@ def _tree(
     level[cells] = 0
     pair = np.full(cells, -1, dtype=np.int64)
     front = level == 0
-    parts = 1 if len(rows.target) < SMALL else 8 * threads.count()
+    parts = 1 if len(rows.target) < SMALL else PARTS
     spans = threads.ranges(cells, parts)
     left = 0 if before else PATIENCE * len(rows.target)
     below = 0

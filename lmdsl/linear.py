@@ -198,36 +198,58 @@ def _solve(
 
 
 def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
-    """Return a solution to about 12 digits of the largest, by BiCGSTAB, or None.
+    """Return a better guess by BiCGSTAB (van der Vorst 1992), None where it breaks down.
 
     It takes one step for each mode that hinders sweeps, such as the slow escape from a well-mixed
     set. A solution >= 0 is the right one: the left Perron vector of a class with spectral radius 1
-    or more contradicts x >= b + M x > 0 there.
+    or more contradicts x >= b + M x > 0 there. SciPy's breaks down at absolute sizes, and its sums
+    depend on the number of BLAS threads.
     """
-    from scipy.sparse.linalg import LinearOperator, bicgstab
-
     known = system.inverse * b
-    if not known.max() < CEILING or system.inverse.max() >= NEVER:
+    unit = float(known.max())
+    if not 0 < unit < CEILING or system.inverse.max() >= NEVER:
         return None
-    out = np.empty(len(b))
+    known /= unit
+    with np.errstate(all="ignore"):
+        y = _bicgstab(system, known, x / unit, stop)
+    if not np.isfinite(y).all() or y.min() < -1e-9 * y.max():
+        return None
+    return np.maximum(unit * y, b)
 
-    def rest(v: Floats) -> Floats:
+
+def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop) -> Floats:
+    """Solve x - D^-1 (M - own) x = b with D = 1 - own, own the diagonal of M, to 13 digits."""
+
+    def applied(v: Floats) -> Floats:
+        out = np.empty(len(v))
         _off_diagonal(system.begin, system.end, system.indices, system.data, v, out)
         return v - system.inverse * out
 
-    def look(_: Floats) -> None:
+    def dot(u: Floats, v: Floats) -> Any:
+        return (u * v).sum()
+
+    x = np.where(np.isfinite(x), x, 0.0)
+    r = b - applied(x)
+    shadow, p, rho = r, r, dot(r, r)
+    enough = 1e-26 * dot(b, b)
+    for _ in range(KRYLOV_STEPS):
+        if not dot(r, r) > enough or rho == 0.0:
+            break
         if stop():
             raise Stopped
-
-    operator = LinearOperator((len(b), len(b)), matvec=rest, dtype=np.float64)
-    start = x if x.max() < CEILING else None
-    with np.errstate(all="ignore"):
-        y, info = bicgstab(
-            operator, known, x0=start, rtol=1e-13, maxiter=KRYLOV_STEPS, callback=look
-        )
-    if info < 0 or not np.isfinite(y).all() or y.min() < -1e-9 * y.max():
-        return None
-    return np.maximum(y, b)
+        q = applied(p)
+        alpha = rho / dot(shadow, q)
+        s = r - alpha * q
+        t = applied(s)
+        omega = dot(t, s) / dot(t, t) if t.any() else np.float64(0.0)
+        following = x + alpha * p + omega * s
+        if not np.isfinite(following).all():
+            break
+        x = following
+        r = s - omega * t
+        before, rho = rho, dot(shadow, r)
+        p = r + (rho / before) * (alpha / omega) * (p - omega * q)
+    return x
 
 
 def _pays(system: System, b: Floats) -> NDArray[np.bool_]:

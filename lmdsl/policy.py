@@ -185,7 +185,8 @@ def iterate(
                 sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
                 rows = Peeled.of(slots.system(done.pair))
                 left = linear.advance(rows, cost[done.pair], x, sweeps, 0.1 * _fall(V, x), 0.0)
-                exact = x if left <= TOLERANCE else None
+                paid = bool((cost[done.pair] > 0).all())  # else what is free has to become 0
+                exact = x if left <= TOLERANCE and paid else None
                 x = np.minimum(x, done.value)
             screen.follow(V, x)
             pair, V = done.pair, x
@@ -198,9 +199,9 @@ def iterate(
                 if exact is None:
                     exact = evaluate(lp, pair, gamma, cost, stop=stop)
             except Stopped:
-                pass
-            if exact is None:
                 return Iteration(*(last or (pair, V)), step, False, screen)
+            if exact is None:
+                return Iteration(*(last or (pair, V)), step, last is not None and not out, screen)
             screen.follow(V, np.minimum(exact, V))
             V = exact
         if exact is not None:

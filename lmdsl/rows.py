@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -114,11 +113,6 @@ class Rows:
         """
         pointer, target = self.pointer.view(np.uint64), self.target.view(np.uint32)
         return pointer, target, self.code, self.shares.value
-
-    @cached_property
-    def longest(self) -> int:
-        """Largest number of entries of a row."""
-        return int(np.diff(self.pointer).max(initial=0))
 
     def exact(self, k: int) -> list[tuple[int, int]]:
         """Return row k as (target, numerator); the numerators sum to ``shares.total``."""

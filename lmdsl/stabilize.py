@@ -195,7 +195,7 @@ def _asked(lp: StabilizationLP, backend: Backend, options: Options) -> Solution:
     try:
         if backend.capabilities.elimination and options.start is not None:
             kept, options = _without_suboptimal(lp, options)
-            asked = lp.part(kept, np.arange(lp.n))
+            asked = lp if len(kept) == lp.K else lp.part(kept, np.arange(lp.n))
         solution = backend.solve(asked, options)
     except BadInput:
         raise

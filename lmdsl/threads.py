@@ -49,7 +49,7 @@ def each(work: Callable[[Part], Outcome], parts: Sequence[Part]) -> list[Outcome
     if helpers < 1:
         return [work(part) for part in parts]
     outcomes: dict[int, Outcome] = {}
-    errors: dict[int, Exception] = {}
+    errors: dict[int, BaseException] = {}
     left, lock = iter(range(len(parts))), threading.Lock()
 
     def take() -> int | None:
@@ -60,7 +60,7 @@ def each(work: Callable[[Part], Outcome], parts: Sequence[Part]) -> list[Outcome
         while (k := take()) is not None:
             try:
                 outcomes[k] = work(parts[k])
-            except Exception as error:
+            except BaseException as error:
                 errors[k] = error
                 drop()
 
@@ -74,9 +74,7 @@ def each(work: Callable[[Part], Outcome], parts: Sequence[Part]) -> list[Outcome
         pull()
     finally:
         drop()
-        for other in others:
-            other.cancel()  # one that has not begun has nothing left to do
-        wait(others)
+        wait([other for other in others if not other.cancel()])  # else it has not begun
     if errors:
         raise errors[min(errors)]
     return [outcomes[k] for k in range(len(parts))]
@@ -105,9 +103,7 @@ def in_order(work: Callable[[Part], Outcome], parts: Iterable[Part]) -> Iterator
         while ahead:
             yield ahead.popleft().result()
     finally:
-        for future in ahead:
-            future.cancel()
-        wait(ahead)
+        wait([future for future in ahead if not future.cancel()])
 
 
 def _done(work: Callable[[Part], Outcome], part: Part) -> Future[Outcome]:

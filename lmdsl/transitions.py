@@ -70,7 +70,8 @@ ALL_ADMISSIBLE = Pilot()
 def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     """Return the bytes that compiling and solving a problem takes at its peak.
 
-    Solving is counted for the default backend.
+    Solving is counted for the default backend, as it goes as a rule: breaking many ties, or a first
+    policy that is hard to find, take more.
     """
     # Capped: a stranger's product of counts may exceed the range of doubles.
     N = min(math.prod(axis.cells for axis in problem.state_box.values()), 10**40)

@@ -30,6 +30,8 @@ Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 
+MOST_GUESSED = 1e-7
+
 RELATIVE_SLACK = (1e-13, 1e-11, 1e-9)
 """Near gamma_bar an absolute slack drowns in the rounding of large values. The value at
 gamma (1 + s) leaves a slack s gamma P V relative to V above; the optimum at gamma (1 - s) below."""
@@ -160,7 +162,7 @@ def _guessed(under: StabilizationLP, V: Floats, tolerance: float) -> Floats | No
         share = float(np.where(V > 0, V / under.cost, 0.0).max(initial=0.0))
     # Rows have at most as many entries as there are codes.
     eps = 8 * (len(under.rows.shares.value) + 12) * bounds.UNIT * share
-    return V * (1 - eps) if eps < tolerance / 4 else None
+    return V * (1 - eps) if eps < min(tolerance / 4, MOST_GUESSED) else None
 
 
 def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:

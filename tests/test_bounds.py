@@ -102,3 +102,28 @@ def test_underflow_before_gamma_proves_nothing_false():
     assert not certificate.check_upper(lp, np.array([0, 1]), np.array([5e-324, 2e-300]))
     lp = mdp([[({-1: 10}, 5e-324)], [({0: 6, -1: 4}, 0.0)]], 10, 1e200)
     assert not certificate.check_lower(lp, np.array([5e-324, 4.5e-124]))
+
+
+@pytest.mark.parametrize("n", [10, 1_000, 1_001, 20_000])
+def test_sums_of_nothing_are_nothing(n):
+    weight, values = np.full(n, 1 / n), np.zeros(n)
+    for direction in (-np.inf, np.inf):
+        assert bounds.weighted(weight, values, direction) == 0.0
+        values[0], weight[0] = 1.0, 0.0  # something where there is no weight
+        assert bounds.weighted(weight, values, direction) == 0.0
+        values[0], weight[0] = 0.0, 1 / n
+    values[-1] = 5e-324
+    assert bounds.weighted(weight, values, np.inf) > 0.0
+    assert bounds.weighted(weight, values, -np.inf) == 0.0
+
+
+@pytest.mark.parametrize("n", [900, 1_500])
+def test_weighted_sums_enclose_the_exact_one(n):
+    rng = np.random.default_rng(n)
+    weight, values = rng.random(n), rng.random(n) * 10.0 ** rng.integers(-9, 9, n)
+    exact = sum(
+        Fraction(a) * Fraction(b) for a, b in zip(weight.tolist(), values.tolist(), strict=True)
+    )
+    below, above = (Fraction(bounds.weighted(weight, values, d)) for d in (-np.inf, np.inf))
+    assert below <= exact <= above
+    assert above - below <= exact * 150 * Fraction(2) ** -52

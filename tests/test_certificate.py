@@ -15,7 +15,7 @@ from problems import doubling, made, standard_map, steps
 import lmdsl as lm
 from lmdsl import feasibility, policy, witness
 from lmdsl.bounds import exactly_below, holds_for_all
-from lmdsl.certificate import Witness, check
+from lmdsl.certificate import CLAIMS, Witness, check
 from lmdsl.exact import check_exactly
 from lmdsl.rows import Rows
 
@@ -258,3 +258,13 @@ def test_the_largest_doubles_are_refused_without_overflow():
         witness = replace(Witness(pair, ones, ones, ones, ones), **vectors)
         for judge in (check, check_exactly):
             assert not judge(lp, witness, 1e-6).verified
+
+
+def test_vectors_of_another_length_prove_nothing():
+    lp = lm.compile(made(steps()))
+    result = lm.solve(lp)
+    pair = lp.pair_pointer[:-1] + result.control_index[lp.cells]
+    for short in (np.ones(0), np.ones(1), np.ones(lp.n - 1), np.ones(lp.n + 1), np.ones((lp.n, 1))):
+        proof = check(lp, Witness(pair, short, short, short, short), 1e-6)
+        assert not any(getattr(proof, name) for name in CLAIMS)
+        assert not check(lp, Witness(None, short), 1e-6).refusal

@@ -172,3 +172,29 @@ def test_true_zeros_are_not_chased():
     assert result.status == "verified"
     assert result.value[0] == 0
     assert result.iterations <= 2
+
+
+@pytest.mark.parametrize("n", [900, 1500])
+def test_free_models_of_any_size_cost_nothing(n):
+    lp = mdp([[({-1 if i == 0 else i - 1: 1}, 0.0)] for i in range(n)], 1, 1.0)
+    result = lm.solve(lp)
+    assert result.status == "verified"
+    assert result.cost == result.lower_bound == result.gap == 0.0
+
+
+def test_free_cells_of_a_small_core_are_worth_exactly_nothing():
+    # A cycle that pays (0, 1), a free one (2, 3), and a long way to both, free in two equal ways.
+    pays = [[({1: 5, -1: 5}, 1.0)], [({0: 5, -1: 5}, 1.0)]]
+    free = [[({3: 9, -1: 1}, 0.0)], [({2: 9, -1: 1}, 0.0), ({2: 5, -1: 5}, 0.0)]]
+    way = [[({2: 5, 3: 5}, 0.0), ({3: 10}, 0.0), ({0: 10}, 1.0)]]
+    way += [[({i: 10}, 0.0), ({0: 10}, 0.5)] for i in range(4, 60)]
+    lp = mdp([*pays, *free, *way], 10, 1.0)
+    answers = [lm.solve(lp, backend) for backend in ("policy-iteration", "highs:simplex")]
+    for result in answers:
+        assert result.status == "verified"
+        value = result.value[lp.cells]
+        np.testing.assert_allclose(value[:2], 2.0, rtol=1e-12)
+        assert (value[2:] < 1e-12).all()  # an upper bound
+        np.testing.assert_array_equal(result.lower[lp.cells[2:]], 0.0)
+    assert answers[0].control_index[lp.cells[3]] == 1  # of two free ways the shorter
+    np.testing.assert_array_equal(answers[0].control_index, answers[1].control_index)
