@@ -7,11 +7,13 @@ import pytest
 import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from models import dense, random_lp
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
-from lmdsl import linear
+from lmdsl import linear, rows
 from lmdsl.peeling import Peeled
+from lmdsl.rows import Slots
 from lmdsl.sweeps import System
 
 
@@ -138,3 +140,25 @@ def test_well_mixed_systems_are_solved_without_factors(monkeypatch, zeros, scale
 def test_a_well_mixed_system_that_grows_has_no_solution():
     M = well_mixed(1100, -1e-3)
     assert linear.solve(M, np.ones(1100)) is None
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_slots_hold_the_rows_of_the_last_policy(monkeypatch, seed):
+    rng = np.random.default_rng(seed)
+    lp = random_lp(rng, 20, 5, gamma=0.9)
+    if seed % 2:
+        monkeypatch.setattr(rows, "MANY", 1)  # in several ranges
+    P, slots = dense(lp), Slots.of(lp.rows, lp.pair_pointer, lp.gamma)
+    pair = lp.pair_pointer[:-1].copy()
+    for _ in range(6):
+        system = slots.system(pair)
+        found = np.zeros((lp.n, lp.n))
+        for i in range(lp.n):
+            span = slice(int(system.begin[i]), int(system.end[i]))
+            np.add.at(found[i], system.indices[span], system.data[span])
+        assert not found.diagonal().any()
+        np.fill_diagonal(found, 1 - 1 / system.inverse)
+        np.testing.assert_allclose(found, lp.gamma * P[pair], rtol=1e-12, atol=1e-15)
+        moved = rng.random(lp.n) < 0.4
+        drawn = rng.integers(lp.pair_pointer[:-1], lp.pair_pointer[1:])
+        pair = np.where(moved, drawn, pair)
