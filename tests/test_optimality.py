@@ -183,18 +183,23 @@ def test_free_models_of_any_size_cost_nothing(n):
 
 
 def test_free_cells_of_a_small_core_are_worth_exactly_nothing():
-    # A cycle that pays (0, 1), a free one (2, 3), and a long way to both, free in two equal ways.
-    pays = [[({1: 5, -1: 5}, 1.0)], [({0: 5, -1: 5}, 1.0)]]
-    free = [[({3: 9, -1: 1}, 0.0)], [({2: 9, -1: 1}, 0.0), ({2: 5, -1: 5}, 0.0)]]
-    way = [[({2: 5, 3: 5}, 0.0), ({3: 10}, 0.0), ({0: 10}, 1.0)]]
-    way += [[({i: 10}, 0.0), ({0: 10}, 0.5)] for i in range(4, 60)]
-    lp = mdp([*pays, *free, *way], 10, 1.0)
+    # A long way to a cycle that pays (56, 57) and a free one (58, 59), which the way can take.
+    way = [[({i + 1: 10}, 0.0), ({56: 10}, 0.5)] for i in range(55)]
+    way += [[({58: 5, 59: 5}, 0.0), ({56: 10}, 0.5)]]
+    pays = [[({57: 5, -1: 5}, 1.0)], [({56: 5, -1: 5}, 1.0)]]
+    free = [[({59: 9, -1: 1}, 0.0)], [({58: 9, -1: 1}, 0.0), ({58: 5, -1: 5}, 0.0)]]
+    lp = mdp([*way, *pays, *free], 10, 1.0)
+    unpaid = np.r_[0:56, 58:60]
+    start = lp.pair_pointer[1:] - 1  # every cell its last control: more than one step to go
+    done = policy.iterate(lp, start, policy.bound(lp, start))
+    assert done.steps > 1
+    np.testing.assert_array_equal(done.value[unpaid], 0.0)
     answers = [lm.solve(lp, backend) for backend in ("policy-iteration", "highs:simplex")]
     for result in answers:
         assert result.status == "verified"
         value = result.value[lp.cells]
-        np.testing.assert_allclose(value[:2], 2.0, rtol=1e-12)
-        assert (value[2:] < 1e-12).all()  # an upper bound
-        np.testing.assert_array_equal(result.lower[lp.cells[2:]], 0.0)
-    assert answers[0].control_index[lp.cells[3]] == 1  # of two free ways the shorter
+        np.testing.assert_allclose(value[56:58], 2.0, rtol=1e-12)
+        assert (value[unpaid] < 1e-12).all()  # an upper bound
+        np.testing.assert_array_equal(result.lower[lp.cells[unpaid]], 0.0)
+    assert answers[0].control_index[lp.cells[59]] == 1  # of two free ways the shorter
     np.testing.assert_array_equal(answers[0].control_index, answers[1].control_index)
