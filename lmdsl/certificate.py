@@ -25,7 +25,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bounds, policy, rational
+from lmdsl import bounds, policy, rational, threads
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -186,9 +186,16 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
     upper = False
     if pair is not None:
         under, own = lp.under(pair), np.arange(lp.n)
-        contraction = None if w is None else check_stabilizing(under, own, w)
-        upper = V_up is not None and check_upper(under, own, V_up)
-        residual = None if mu is None else check_measure(under, own, mu)
+
+        def of_policy() -> tuple[float | None, bool]:
+            proved = None if w is None else check_stabilizing(under, own, w)
+            return proved, V_up is not None and check_upper(under, own, V_up)
+
+        def of_measure() -> float | None:
+            return None if mu is None else check_measure(under, own, mu)
+
+        claims, residual = threads.both(of_policy, of_measure)
+        contraction, upper = claims
     lower = W is not None and check_lower(lp, W)
     if upper and V_up is not None:
         cost = bounds.weighted(lp.weight, V_up, math.inf)

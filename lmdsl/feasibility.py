@@ -20,7 +20,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Feasible:
-    """A gamma-stabilizing policy, with its unit-cost value w = 1 + g P_u w."""
+    """A g-stabilizing policy, and a proof of it: w > 0 with w > g P_u w."""
 
     pair: Pairs
     w: Floats
@@ -50,10 +50,22 @@ class Undecided:
 
 
 def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
-    """Sweep a guess of the unit-cost value until it proves a policy g-stabilizing, a while."""
-    under, own, w = lp.under(pair), np.arange(lp.n), w.copy()
-    linear.advance(peeled(under, own, lp.growth), np.ones(lp.n), w, MOST_SWEEPS, 0.0, 0.25)
-    return w if bounds.decrease(under, own, w, lp.growth) is not None else None
+    """Make of a guess a proof that a policy is g-stabilizing; None where it takes too long.
+
+    Where its own value is soon known and every cost positive, it is the proof; else the guess is
+    swept towards the unit-cost value for a while.
+    """
+    under, own = lp.under(pair), np.arange(lp.n)
+    rows = peeled(under, own, lp.growth)
+    paid = rows.small and bool((under.cost > 0).all())
+    for cost in (under.cost, np.ones(lp.n)) if paid else (np.ones(lp.n),):
+        proof = w.copy()
+        left = linear.advance(rows, cost, proof, MOST_SWEEPS, 0.0, 0.25)
+        if bounds.decrease(under, own, proof, lp.growth) is not None:
+            return proof
+        if left == np.inf:
+            break
+    return None
 
 
 def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused | Undecided:

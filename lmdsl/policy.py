@@ -229,9 +229,12 @@ def bound(lp: StabilizationLP, pair: Pairs, w: Floats | None = None) -> Floats |
     if w is None or d is None:
         return None
     with np.errstate(over="ignore"):
-        V: Floats = w * (float((under.cost / d).max()) * (1 + 1e-12))
+        factor = float((under.cost / d).max()) * (1 + 1e-12)
+        V: Floats = w * factor
     if not (V < CEILING).all():
         return None
+    if lp.gamma == lp.growth and bool((d * (factor * (1 - 1e-2)) <= under.cost).all()):
+        return V  # within a percent of the value already
     x = V.copy()
     linear.advance(peeled(under, own, lp.gamma), under.cost, x, MOST_SWEEPS, 1e-2, 0.0)
     return np.minimum(x, V)

@@ -106,6 +106,13 @@ class Screen:
     ) -> tuple[NDArray[np.bool_], Pairs, bool]:
         """Find the columns with Q <= Q_min + tolerance |Q_min| at V, and those of a policy.
 
+        Parameters
+        ----------
+        V, tolerance
+            An optimal value, shape (n,), to a relative 1e-9, and what counts as equal, below 1e-7.
+        pair
+            A policy with this value, a column per cell.
+
         Returns
         -------
         ties : shape (K,)
@@ -144,59 +151,66 @@ def _pass(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Improve the cells of a range in turn; ``least`` gets the bounds of the rows that were read.
 
-    V_i >= Q of the cell's own pair, so a pair whose bound exceeds V_i is no better; the own Q is
-    computed only where some rival remains. ``rival`` is the smallest bound of a cell's rivals.
+    V_i >= Q of the cell's own pair, so a pair whose bound exceeds V_i is no better; the own row is
+    read only where some rival remains. ``rival`` is the smallest bound of a cell's rivals.
     """
-    changed, looked = 0, 0
+    changed, looked = 0, np.uint64(0)
     first, last = np.uint64(first), np.uint64(last)
     x = V.copy()  # other ranges keep the values from before the pass
     store, shrink = (1.0 - 1e-6) / scale, 1.0 / scale
+    candidate = np.empty(_most(first, last, pair_pointer), dtype=np.uint64)
     for t in range(last - first):
         i = last - ONE - t if backwards else first + t
-        own = pair[i]
+        begin, end, own = pair_pointer[i], pair_pointer[i + ONE], pair[i]
         new[i] = own
         limit = x[i] * shrink
         if rival[i] >= limit:
             continue
-        own_q, best, choice = np.inf, np.inf, own
-        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
-            if least[k] >= limit or k == own:
-                continue
-            if own_q == np.inf:
-                own_q = 0.0
-                for e in range(pointer[own], pointer[own + ONE]):
-                    own_q += share[code[e]] * x[target[e]]
-                own_q = gamma * own_q + cost[own]
-                looked += 1
-                least[own] = own_q * store if own_q * store < MOST else MOST
-                best = own_q
-                if own_q * shrink < limit:
-                    limit = own_q * shrink
-                if least[k] >= limit:
-                    continue
+        # First a list without a branch, then a loop without one: a processor that guesses wrong
+        # which rows are read waits for memory.
+        count, rest = np.uint64(0), MOST
+        for d in range(end - begin):
+            k = end - ONE - d if backwards else begin + d
+            near = (least[k] < limit) | (k == own)
+            candidate[count] = k
+            count += np.uint64(near)
+            bound = MOST if near else least[k]
+            rest = bound if bound < rest else rest
+        own_q, best, second, choice = np.inf, np.inf, np.inf, own
+        for c in range(count):
+            k = candidate[c]
             q = 0.0
             for e in range(pointer[k], pointer[k + ONE]):
                 q += share[code[e]] * x[target[e]]
             q = gamma * q + cost[k]
-            looked += 1
             least[k] = q * store if q * store < MOST else MOST
+            own_q = q if k == own else own_q
+            larger = q if q > best else best
+            second = larger if larger < second else second
             if q < best:
-                best, choice, limit = q, k, q * shrink
-        if choice != own and best < own_q - margin * abs(own_q):
-            changed += 1
-            new[i] = choice
-        else:
-            best = own_q
+                best, choice = q, k
+        looked += count
+        if choice != own:
+            if best < own_q - margin * abs(own_q):
+                changed += 1
+                new[i] = choice
+            else:
+                second, best = best, own_q
         if best < x[i]:
             x[i] = best
-        smallest = MOST
-        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
-            if k != new[i] and least[k] < smallest:
-                smallest = least[k]
-        rival[i] = smallest
+        rival[i] = second * store if second * store < rest else rest
     for i in range(first, last):
         value[i] = x[i]
     return changed, looked
+
+
+@njit(cache=True, nogil=True)
+def _most(first, last, pair_pointer):  # type: ignore[no-untyped-def]
+    """Return the largest number of pairs of a cell."""
+    most = np.uint64(0)
+    for i in range(first, last):
+        most = max(most, pair_pointer[i + ONE] - pair_pointer[i])
+    return most
 
 
 @njit(cache=True, nogil=True)
@@ -204,32 +218,38 @@ def _ties(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, tolerance, scale,
     least, pair, ties, chosen,
 ):  # fmt: skip
-    """Mark the tied columns of a range of cells: first Q_min, then all that come near."""
+    """Mark the tied columns of a range of cells: first Q_min, then all that come near.
+
+    Where the bounds leave only a cell's own pair, no row is read.
+    """
     several = False
-    choices = np.uint64(0)
     first, last = np.uint64(first), np.uint64(last)
+    most = _most(first, last, pair_pointer)
+    q, candidate = np.empty(most), np.empty(most, dtype=np.uint64)
     for i in range(first, last):
-        choices = max(choices, pair_pointer[i + ONE] - pair_pointer[i])
-    q = np.empty(choices)
-    for i in range(first, last):
-        begin, end = pair_pointer[i], pair_pointer[i + ONE]
+        own, limit = pair[i], V[i] * (1.0 + tolerance + 1e-9) / scale
+        count = np.uint64(0)
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
+            ties[k] = False
+            candidate[count] = k
+            count += np.uint64((least[k] <= limit) | (k == own))
+        if count == ONE:
+            ties[own], chosen[i] = True, own
+            continue
         best = np.inf
-        for k in range(begin, end):
-            if least[k] * scale > best * (1.0 + tolerance):
-                q[k - begin] = np.inf
-                continue
-            q_k = 0.0
+        for c in range(count):
+            k, q_k = candidate[c], 0.0
             for e in range(pointer[k], pointer[k + ONE]):
                 q_k += share[code[e]] * V[target[e]]
-            q_k = gamma * q_k + cost[k]
-            q[k - begin] = q_k
-            best = min(best, q_k)
-        count, chosen[i] = 0, -1
-        for k in range(begin, end):
-            ties[k] = q[k - begin] <= best + tolerance * abs(best) or k == pair[i]
-            if ties[k]:
-                count += 1
+            q[c] = gamma * q_k + cost[k]
+            best = min(best, q[c])
+        tied, chosen[i] = 0, -1
+        for c in range(count):
+            k = candidate[c]
+            if q[c] <= best + tolerance * abs(best) or k == own:
+                ties[k] = True
+                tied += 1
                 if chosen[i] < 0:
                     chosen[i] = k
-        several |= count > 1
+        several |= tied > 1
     return several

@@ -12,12 +12,14 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from numba import config
 
 Part = TypeVar("Part")
 Outcome = TypeVar("Outcome")
+First = TypeVar("First")
+Second = TypeVar("Second")
 
 _pool: ThreadPoolExecutor | None = None
 _members = 0
@@ -78,6 +80,12 @@ def each(work: Callable[[Part], Outcome], parts: Sequence[Part]) -> list[Outcome
     if errors:
         raise errors[min(errors)]
     return [outcomes[k] for k in range(len(parts))]
+
+
+def both(one: Callable[[], First], other: Callable[[], Second]) -> tuple[First, Second]:
+    """Return ``(one(), other())``."""
+    found: list[Any] = each(lambda work: work(), (one, other))
+    return found[0], found[1]
 
 
 def in_order(work: Callable[[Part], Outcome], parts: Iterable[Part]) -> Iterator[Outcome]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bounds, linear, policy
+from lmdsl import bounds, linear, policy, threads
 from lmdsl.certificate import (
     MEASURE_TOLERANCE,
     Verified,
@@ -42,7 +42,6 @@ def certify(
     pair: Pairs,
     tolerance: float,
     value: Floats | None = None,
-    w: Floats | None = None,
 ) -> Verified:
     """Make the vectors of claims 1 to 4 for a policy and check them.
 
@@ -52,10 +51,10 @@ def certify(
         The finite model and one column per cell.
     tolerance
         Largest gap that counts as verified.
-    value, w
-        Guesses of the policy's value and its unit-cost value; made where missing.
+    value
+        The policy's value as :func:`lmdsl.policy.evaluate` gives it; made where missing.
     """
-    witness, V = _first_try(lp, pair, tolerance, value, w)
+    witness, V = _first_try(lp, pair, tolerance, value)
     proof = check(lp, witness, tolerance)
     if V is not None and (proof.gap is None or proof.gap > tolerance):
         witness = _tightened(lp, witness, V, tolerance)
@@ -64,18 +63,31 @@ def certify(
 
 
 def _first_try(
-    lp: StabilizationLP, pair: Pairs, tolerance: float, value: Floats | None, w: Floats | None
+    lp: StabilizationLP, pair: Pairs, tolerance: float, value: Floats | None
 ) -> tuple[Witness, Floats | None]:
     """Return vectors that serve as a rule, and the policy's value."""
     under, own = lp.under(pair), np.arange(lp.n)
     rows = policy.peeled(under, own, lp.gamma)
     growing = rows if lp.growth == lp.gamma else None
-    w, d = policy.stability_vector(under, own, w, sharp=True, rows=growing)
-    V = policy.evaluate(under, own, start=value, transient=w is not None, rows=rows)
-    if V is None:
-        return Witness(pair, w, None, lower_vector(lp, None, tolerance), None), None
-    V_up, W = upper_vector(under, own, V, w, d), _guessed(under, V, tolerance)
-    return Witness(pair, w, V_up, W, _measure_vector(under, rows)), V
+
+    def bounds_of_cost() -> tuple[Witness, Floats | None]:
+        w, d = policy.stability_vector(under, own, sharp=True, rows=growing)
+        V = value
+        if V is None:
+            V = policy.evaluate(under, own, transient=w is not None, rows=rows)
+        if V is None:
+            return Witness(pair, w, None, lower_vector(lp, None, tolerance), None), None
+        return Witness(pair, w, upper_vector(under, own, V, w, d), _guessed(under, V, tolerance)), V
+
+    def measure() -> Floats | None:
+        return _measure_vector(under, rows)
+
+    if value is not None:  # then the measure is finite too
+        (witness, V), mu = threads.both(bounds_of_cost, measure)
+    else:
+        witness, V = bounds_of_cost()
+        mu = None if V is None else measure()
+    return replace(witness, mu=mu), V
 
 
 def _tightened(lp: StabilizationLP, witness: Witness, V: Floats, tolerance: float) -> Witness:
