@@ -169,22 +169,19 @@ def _rise(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, gamma, V, backwards, value, pair
 ):
     first, last = np.uint64(first), np.uint64(last)
-    for i in range(first, last):
-        value[i] = V[i]
+    x = V.copy()  # other ranges keep the values from before the pass
     for t in range(last - first):
         i = last - ONE - t if backwards else first + t
         best, choice = np.inf, pair_pointer[i]
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             own, q = 0.0, 0.0
             for e in range(pointer[k], pointer[k + ONE]):
-                j = target[e]
-                if j == i:
-                    own += share[code[e]]
-                else:
-                    q += share[code[e]] * (value[j] if first <= j < last else V[j])
-            own *= gamma
-            if own < 1.0:
-                q = (1.0 + gamma * q) / (1.0 - own)
-                if q < best:
-                    best, choice = q, k
-        value[i], pair[i] = max(best, value[i]), choice
+                q += share[code[e]] * x[target[e]]
+                own += share[code[e]] if target[e] == i else 0.0
+            q, left = 1.0 + gamma * (q - own * x[i]), 1.0 - gamma * own
+            if left > 0.0 and q < best * left:
+                best, choice = q / left, k
+        x[i] = best if best > x[i] else x[i]
+        pair[i] = choice
+    for i in range(first, last):
+        value[i] = x[i]

@@ -22,7 +22,6 @@ from lmdsl.linear import Stop as Stop
 from lmdsl.linear import Stopped, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.peeling import Peeled
-from lmdsl.rows import Slots
 from lmdsl.screening import Pass, Screen
 from lmdsl.sweeps import CEILING, ONE, TOLERANCE
 
@@ -166,7 +165,6 @@ def iterate(
     """
     screen = Screen(lp, gamma, cost)
     gamma, cost = screen.gamma, screen.cost
-    slots = Slots.of(lp.rows, lp.pair_pointer, gamma)
     rows: Peeled | None = None  # those of the policy at hand
     V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
     hasty = False  # the policy at hand was not evaluated at all
@@ -183,9 +181,10 @@ def iterate(
             else:
                 x = x.copy()
                 sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
-                rows = Peeled.of(slots.system(done.pair))
-                left = linear.advance(rows, cost[done.pair], x, sweeps, 0.1 * _fall(V, x), 0.0)
-                paid = bool((cost[done.pair] > 0).all())  # else what is free has to become 0
+                rows = Peeled.of(screen.slots.system(done.pair))
+                fall = 0.0 if rows.small else _fall(V, x)
+                left = linear.advance(rows, screen.paid, x, sweeps, 0.1 * fall, 0.0)
+                paid = bool((screen.paid > 0).all())  # else what is free has to become 0
                 exact = x if left <= TOLERANCE and paid else None
                 x = np.minimum(x, done.value)
             screen.follow(V, x)
@@ -194,7 +193,7 @@ def iterate(
             return Iteration(*last, step, not out, screen)
         else:
             try:
-                rows = rows or Peeled.of(slots.system(pair))
+                rows = rows or Peeled.of(screen.slots.system(pair))
                 exact = evaluate(lp, pair, gamma, cost, done.value, True, stop, rows)
                 if exact is None:
                     exact = evaluate(lp, pair, gamma, cost, stop=stop)

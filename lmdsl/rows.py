@@ -186,7 +186,7 @@ class Slots:
         self.rows, self.gamma = rows, gamma
         ends = np.cumsum(room)
         count, entries = len(room), int(ends[-1]) if len(room) else 0
-        self.chosen = np.full(count, -1, dtype=np.int64)
+        self.chosen = np.full(count, rows.count, dtype=np.uint64)  # none
         self.held = System(
             (ends - room).view(np.uint64),
             np.empty(count, dtype=np.uint64),
@@ -208,18 +208,22 @@ class Slots:
 
     def system(self, chosen: NDArray[np.int64]) -> System:
         """Return gamma P for one row of each cell; it holds until the next call."""
-        s, columns = self.held, np.uint32(self.rows.columns)
-        now, before = chosen.view(np.uint64), self.chosen.view(np.uint64)
+        now = chosen.view(np.uint64)
 
         def fill(span: tuple[int, int]) -> None:
-            _fill(
-                *span, now, before, *self.rows.kernel, columns, self.gamma,
-                s.begin, s.end, s.indices, s.data, s.inverse,
-            )  # fmt: skip
+            _fill(*span, now, *self.kernel)
 
         threads.each(fill, _spans(len(chosen)))
-        self.chosen = chosen.copy()
-        return s
+        return self.held
+
+    @property
+    def kernel(self) -> tuple[Any, ...]:
+        """The row held of each cell, all rows, and the system, as compiled loops use them."""
+        s, columns = self.held, np.uint32(self.rows.columns)
+        return (
+            self.chosen, *self.rows.kernel, columns, self.gamma,
+            s.begin, s.end, s.indices, s.data, s.inverse,
+        )  # fmt: skip
 
 
 def _spans(count: int) -> list[tuple[int, int]]:
@@ -256,21 +260,31 @@ def _fill(  # type: ignore[no-untyped-def]
     first, last, rows, before, pointer, target, code, share, columns, gamma, begin, end, indices,
     data, inverse,
 ):  # fmt: skip
-    """Copy rows without the attractor's share and without the diagonal, which is solved for."""
     for r in range(np.uint64(first), np.uint64(last)):
-        own, k, used = 0.0, rows[r], begin[r]
-        if k == before[r]:
-            continue
-        for e in range(pointer[k], pointer[k + ONE]):
-            j = target[e]
-            if j == r:
-                own += gamma * share[code[e]]
-            elif j < columns:
-                indices[used] = j
-                data[used] = gamma * share[code[e]]
-                used += ONE
-        inverse[r] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
-        end[r] = used
+        if rows[r] != before[r]:
+            before[r] = rows[r]
+            copy_row(
+                r, rows[r], pointer, target, code, share, columns, gamma,
+                begin, end, indices, data, inverse,
+            )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def copy_row(  # type: ignore[no-untyped-def]
+    r, k, pointer, target, code, share, columns, gamma, begin, end, indices, data, inverse
+):
+    """Copy row k as row r of a system: the diagonal apart, without the attractor's share."""
+    own, used = 0.0, begin[r]
+    for e in range(pointer[k], pointer[k + ONE]):
+        j = target[e]
+        if j == r:
+            own += gamma * share[code[e]]
+        elif j < columns:
+            indices[used] = j
+            data[used] = gamma * share[code[e]]
+            used += ONE
+    inverse[r] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
+    end[r] = used
 
 
 @njit(cache=True, nogil=True)

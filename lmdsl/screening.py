@@ -11,6 +11,7 @@ cell, no rows.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from lmdsl import bellman
 from lmdsl.lp import StabilizationLP
+from lmdsl.rows import Slots, copy_row
 from lmdsl.sweeps import ONE
 
 Floats = NDArray[np.float64]
@@ -58,6 +60,12 @@ class Screen:
         The model.
     gamma, cost
         Other than the LP's own; ``cost`` has shape (K,).
+
+    Attributes
+    ----------
+    slots, paid
+        The rows of the policy after the last pass, copied while they are at hand, and its stage
+        costs, shape (n,).
     """
 
     def __init__(
@@ -68,8 +76,14 @@ class Screen:
         self.cost = lp.cost if cost is None else cost
         self.least = np.zeros(lp.K, dtype=np.float32)
         self.rival = np.zeros(lp.n, dtype=np.float32)
+        self.paid = np.empty(lp.n)
         self.scale = 1.0
         self.passes = 0
+
+    @cached_property
+    def slots(self) -> Slots:
+        """Room for the rows of the policy."""
+        return Slots.of(self.lp.rows, self.lp.pair_pointer, self.gamma)
 
     def improve(self, V: Floats, pair: Pairs, margin: float) -> Pass:
         """Change a control where another one is better by more than a relative margin.
@@ -88,13 +102,12 @@ class Screen:
         value, new = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
         x, backwards = bellman.padded(V), self.passes % 2 == 1
         self.passes += 1
-        own = pair.view(np.uint64)
+        own, slots = pair.view(np.uint64), self.slots.kernel
 
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(
-                *cells, *lp.kernel,
-                self.cost, self.gamma, x, own, margin, self.scale,
-                backwards, self.least, self.rival, value, new,
+                *cells, lp.kernel[0], self.cost, x, own, margin, self.scale, backwards,
+                self.least, self.rival, value, new.view(np.uint64), self.paid, *slots,
             )  # fmt: skip
             return int(changed), int(looked)
 
@@ -135,9 +148,7 @@ class Screen:
 
     def follow(self, before: Floats, after: Floats) -> None:
         """Note that V fell from ``before`` to ``after``."""
-        on = before > 0
-        ratio = float(np.divide(after, before, out=np.ones(len(before)), where=on).min(initial=1.0))
-        self.scale *= ratio * (1 - 1e-13)
+        self.scale *= float(_least_ratio(before, after)) * (1 - 1e-13)
         if self.scale < LEAST_SCALE:
             self.least *= np.float32(self.scale)
             self.rival *= np.float32(self.scale)
@@ -145,9 +156,19 @@ class Screen:
 
 
 @njit(cache=True, nogil=True)
+def _least_ratio(before, after):  # type: ignore[no-untyped-def]
+    """The smallest after / before where ``before`` is positive, at most 1."""
+    ratio = 1.0
+    for i in range(len(before)):
+        if after[i] < ratio * before[i]:
+            ratio = after[i] / before[i]
+    return ratio
+
+
+@njit(cache=True, nogil=True)
 def _pass(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, pair, margin, scale,
-    backwards, least, rival, value, new,
+    first, last, pair_pointer, cost, V, pair, margin, scale, backwards, least, rival, value, new,
+    paid, held, pointer, target, code, share, columns, gamma, begins, ends, indices, data, inverse,
 ):  # fmt: skip
     """Improve the cells of a range in turn; ``least`` gets the bounds of the rows that were read.
 
@@ -161,44 +182,50 @@ def _pass(  # type: ignore[no-untyped-def]
     candidate = np.empty(_most(first, last, pair_pointer), dtype=np.uint64)
     for t in range(last - first):
         i = last - ONE - t if backwards else first + t
-        begin, end, own = pair_pointer[i], pair_pointer[i + ONE], pair[i]
+        own, limit = pair[i], x[i] * shrink
         new[i] = own
-        limit = x[i] * shrink
-        if rival[i] >= limit:
-            continue
-        # First a list without a branch, then a loop without one: a processor that guesses wrong
-        # which rows are read waits for memory.
-        count, rest = np.uint64(0), MOST
-        for d in range(end - begin):
-            k = end - ONE - d if backwards else begin + d
-            near = (least[k] < limit) | (k == own)
-            candidate[count] = k
-            count += np.uint64(near)
-            bound = MOST if near else least[k]
-            rest = bound if bound < rest else rest
-        own_q, best, second, choice = np.inf, np.inf, np.inf, own
-        for c in range(count):
-            k = candidate[c]
-            q = 0.0
-            for e in range(pointer[k], pointer[k + ONE]):
-                q += share[code[e]] * x[target[e]]
-            q = gamma * q + cost[k]
-            least[k] = q * store if q * store < MOST else MOST
-            own_q = q if k == own else own_q
-            larger = q if q > best else best
-            second = larger if larger < second else second
-            if q < best:
-                best, choice = q, k
-        looked += count
-        if choice != own:
-            if best < own_q - margin * abs(own_q):
-                changed += 1
-                new[i] = choice
-            else:
-                second, best = best, own_q
-        if best < x[i]:
-            x[i] = best
-        rival[i] = second * store if second * store < rest else rest
+        if rival[i] < limit:
+            # First a list without a branch, then a loop without one: a processor that guesses wrong
+            # which rows are read waits for memory.
+            begin, end = pair_pointer[i], pair_pointer[i + ONE]
+            count, rest = np.uint64(0), MOST
+            for d in range(end - begin):
+                k = end - ONE - d if backwards else begin + d
+                near = (least[k] < limit) | (k == own)
+                candidate[count] = k
+                count += np.uint64(near)
+                bound = MOST if near else least[k]
+                rest = bound if bound < rest else rest
+            own_q, best, second, choice = np.inf, np.inf, np.inf, own
+            for c in range(count):
+                k = candidate[c]
+                q = 0.0
+                for e in range(pointer[k], pointer[k + ONE]):
+                    q += share[code[e]] * x[target[e]]
+                q = gamma * q + cost[k]
+                least[k] = q * store if q * store < MOST else MOST
+                own_q = q if k == own else own_q
+                larger = q if q > best else best
+                second = larger if larger < second else second
+                if q < best:
+                    best, choice = q, k
+            looked += count
+            if choice != own:
+                if best < own_q - margin * abs(own_q):
+                    changed += 1
+                    new[i] = choice
+                else:
+                    second, best = best, own_q
+            if best < x[i]:
+                x[i] = best
+            rival[i] = second * store if second * store < rest else rest
+        if held[i] != new[i]:  # its row is at hand now
+            held[i] = new[i]
+            paid[i] = cost[new[i]]
+            copy_row(
+                i, new[i], pointer, target, code, share, columns, gamma,
+                begins, ends, indices, data, inverse,
+            )  # fmt: skip
     for i in range(first, last):
         value[i] = x[i]
     return changed, looked
