@@ -1,11 +1,13 @@
 """The part of a system without cycles: solved by substitution, whatever the rest costs.
 
 A policy leads most cells to the attractor without ever passing through the same cell again. Cells
-that no other cell leads to are taken away, then those that only these lead to, and so on (Kahn's
-algorithm). What is left, the core, holds every cycle (staying put is no cycle here) and all that
-cycles lead to; nothing in it depends on the cells taken away. So x = b + M x is solved on the core,
-then the others follow in the reverse order, each from cells already known. The transposed system,
-which a measure satisfies, goes the other way: mass flows down to the core, which is solved last.
+that no other cell leads to are taken away, then those that only these lead to, and so on, level by
+level (Kahn's algorithm). No cell leads to another of its level, so a large level is solved in
+several threads; the cells of a level ascend, which keeps memory close. What is left, the core,
+holds every cycle (staying put is no cycle here) and all that cycles lead to; nothing in it depends
+on the cells taken away. So x = b + M x is solved on the core, then the others follow in the reverse
+order, each from cells already known. The transposed system, which a measure satisfies, goes the
+other way: mass flows down to the core, which is solved last.
 """
 
 from __future__ import annotations
@@ -16,10 +18,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lmdsl import threads
 from lmdsl.sweeps import CEILING, NEVER, ONE, System
 
 Floats = NDArray[np.float64]
 Cells = NDArray[np.uint32]
+
+MANY, PARTS = 40_000, 8
+"""Cells of a level that are worth several threads, and into how many ranges they are split."""
+WORD, BYTE = np.uint64(64), np.uint64(8)
 
 
 @dataclass(frozen=True)
@@ -32,6 +39,8 @@ class Peeled:
         The whole.
     order
         Cells outside the core, each before all it leads to.
+    levels
+        Where each level of ``order`` ends.
     core
         The other cells, ascending.
     inner
@@ -40,6 +49,7 @@ class Peeled:
 
     system: System
     order: Cells
+    levels: NDArray[np.int64]
     core: Cells
     inner: System
 
@@ -47,10 +57,12 @@ class Peeled:
     def of(cls, system: System) -> Peeled:
         """Find the core of a system."""
         n = len(system.begin)
-        order = np.empty(n, dtype=np.uint32)
-        count = _peel(system.begin, system.end, system.indices, order)
+        order = np.empty(n + int(BYTE), dtype=np.uint32)
+        ends = np.empty(n + 1, dtype=np.int64)
+        count, levels = _peel(system.begin, system.end, system.indices, order, ends)
+        order, ends = order[:n], ends[:levels].copy()
         if not count:
-            return cls(system, order[:0], order, system)
+            return cls(system, order[:0], ends, order, system)
         core = order[count:]
         number = np.empty(n, dtype=np.uint32)
         number[core] = np.arange(len(core), dtype=np.uint32)
@@ -61,7 +73,7 @@ class Peeled:
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
         _take(core, system.begin, system.end, system.indices, system.data, number, indices, data)
         inner = System(begin, begin + length, indices, data, system.inverse[core])
-        return cls(system, order[:count], core, inner)
+        return cls(system, order[:count], ends, core, inner)
 
     @property
     def small(self) -> bool:
@@ -71,7 +83,30 @@ class Peeled:
     def substitute(self, b: Floats, x: Floats) -> bool:
         """Solve x = b + M x outside the core in place; False where there is no finite solution."""
         s = self.system
-        return bool(_back(self.order, s.begin, s.end, s.indices, s.data, s.inverse, b, x))
+
+        def part(span: tuple[int, int]) -> bool:
+            cells = self.order[span[0] : span[1]]
+            return bool(_back(cells, s.begin, s.end, s.indices, s.data, s.inverse, b, x))
+
+        last = len(self.order)
+        while last:
+            first = self._before(last)
+            if last - first < MANY:
+                while first and first - self._before(first) < MANY:
+                    first = self._before(first)
+                found = part((first, last))
+            else:
+                spans = [(first + i, first + k) for i, k in threads.ranges(last - first, PARTS)]
+                found = all(threads.each(part, spans))
+            if not found:
+                return False
+            last = first
+        return True
+
+    def _before(self, end: int) -> int:
+        """Return where the level begins that ends at ``end``."""
+        k = int(np.searchsorted(self.levels, end))
+        return int(self.levels[k - 1]) if k else 0
 
     def flow(self, x: Floats) -> bool:
         """Solve x = b + M'x outside the core in place, for x = b on entry.
@@ -84,34 +119,48 @@ class Peeled:
 
 
 @njit(cache=True, nogil=True)
-def _peel(begin, end, indices, order):  # type: ignore[no-untyped-def]
-    """Order the cells outside the core, then those in it; return how many are outside."""
+def _peel(begin, end, indices, order, ends):  # type: ignore[no-untyped-def]
+    """Order the cells outside the core, then those in it; return how many are outside, and levels.
+
+    No branch depends on data: every cell is written and only those that count are kept.
+    """
     n = np.uint64(len(begin))
     ways = np.zeros(n, dtype=np.uint32)  # how many entries lead to a cell
     for i in range(n):
         for e in range(begin[i], end[i]):
             ways[indices[e]] += np.uint32(1)
-    count = np.uint64(0)
+    count, at, levels = np.uint64(0), np.uint64(0), 0
     for i in range(n):
-        if ways[i] == 0:
-            order[count] = i
-            count += ONE
-    at = np.uint64(0)
+        order[count] = i
+        count += np.uint64(ways[i] == 0)
+    free = np.zeros(n // WORD + ONE, dtype=np.uint64)  # cells of the next level, a bit each
     while at < count:
-        i = order[at]
-        at += ONE
-        for e in range(begin[i], end[i]):
-            j = indices[e]
-            ways[j] -= np.uint32(1)
-            if ways[j] == 0:
-                order[count] = j
-                count += ONE
+        ends[levels] = last = count
+        levels += 1
+        low, high = np.uint64(len(free)), np.uint64(0)
+        for t in range(at, last):
+            i = order[t]
+            for e in range(begin[i], end[i]):
+                j = np.uint64(indices[e])
+                left = ways[j] - np.uint32(1)
+                ways[j] = left
+                word = j // WORD
+                free[word] |= np.uint64(left == 0) << (j % WORD)
+                low, high = min(low, word), max(high, word)
+        for w in range(low, high + ONE):
+            bits, first = free[w], np.uint64(w) * WORD
+            free[w] = np.uint64(0)
+            while bits != np.uint64(0):
+                for d in range(BYTE):
+                    order[count] = first + d
+                    count += (bits >> d) & ONE
+                bits, first = bits >> BYTE, first + BYTE
+        at = last
     outside = count
     for i in range(n):
-        if ways[i] > 0:
-            order[count] = i
-            count += ONE
-    return outside
+        order[count] = i
+        count += np.uint64(ways[i] > 0)
+    return outside, levels
 
 
 @njit(cache=True, nogil=True)

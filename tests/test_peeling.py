@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -11,7 +13,7 @@ from models import dense, random_lp
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 
-from lmdsl import linear, rows
+from lmdsl import linear, peeling, rows, threads
 from lmdsl.peeling import Peeled
 from lmdsl.rows import Slots
 from lmdsl.sweeps import System
@@ -46,6 +48,12 @@ def test_core_is_closed_and_holds_every_cycle(seed, n, cyclic):
     assert not off[np.ix_(core, ~core)].any()  # nothing leads out of it
     place = np.full(n, n)
     place[peeled.order] = np.arange(len(peeled.order))
+    ends = [0, *peeled.levels]
+    assert ends[-1] == len(peeled.order)
+    for first, last in pairwise(ends):
+        level = peeled.order[first:last]
+        assert (np.diff(level.astype(int)) > 0).all()
+        assert not off[np.ix_(level, level)].any()
     for i in peeled.order:
         assert (place[np.flatnonzero(off[i])] > place[i]).all()
     _, label = connected_components(sp.csr_array(off), connection="strong")
@@ -85,6 +93,21 @@ def test_advancing_stays_on_its_side(seed, n, cyclic):
         else:
             assert (x <= before * (1 + 1e-13)).all()
             assert (x >= ahead * (1 - 1e-13)).all()
+
+
+@pytest.mark.parametrize("many", [1, 4, 1000])
+@pytest.mark.parametrize("workers", [1, 2])
+def test_large_levels_in_several_threads(monkeypatch, many, workers):
+    M = matrix(3, 300, 5)
+    peeled, b = Peeled.of(System.of(M)), np.random.default_rng(0).random(300)
+    monkeypatch.setattr(peeling, "MANY", many)
+    monkeypatch.setattr(threads, "count", lambda: workers)
+    x = np.linalg.solve(np.eye(300) - M.toarray(), b)
+    y = np.where(np.isin(np.arange(300), peeled.core), x, np.nan)
+    assert peeled.substitute(b, y)
+    np.testing.assert_allclose(y, x, rtol=1e-12)
+    never = sp.csr_array(np.eye(300))
+    assert not Peeled.of(System.of(never)).substitute(np.ones(300), np.ones(300))
 
 
 def test_a_system_without_cycles_is_solved_at_once():
