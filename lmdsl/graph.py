@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from lmdsl import threads
 from lmdsl.rows import Rows
+from lmdsl.sweeps import ONE
 from lmdsl.transitions import Transitions
 
 
@@ -176,9 +177,11 @@ def _tree(
     left = 0 if before else PATIENCE * len(rows.target)
     below = 0
 
+    pairs, all_alive = pair_pointer.view(np.uint64), bool(alive.all())
+
     def sweep(span: tuple[int, int]) -> int:
         return int(
-            _sweep(pair_pointer, rows.pointer, rows.target, alive, front, below, level, pair, *span)
+            _sweep(pairs, *rows.kernel[:2], alive, all_alive, front, below, level, pair, *span)
         )
 
     while left > 0 and front.any():
@@ -242,35 +245,43 @@ def _transpose(pointer, target, out_pointer, pair):  # type: ignore[no-untyped-d
             position[j] += 1
 
 
-_POINTER = types.Array(types.int64, 1, "C", readonly=True)
-_TARGET = types.Array(types.int32, 1, "C", readonly=True)
+_POINTER = types.Array(types.uint64, 1, "C", readonly=True)
+_TARGET = types.Array(types.uint32, 1, "C", readonly=True)
 _MASK = types.Array(types.boolean, 1, "C", readonly=True)
 
 
 @njit(
-    types.int64(
-        _POINTER, _POINTER, _TARGET, _MASK, _MASK,
-        types.int64, types.int32[::1], types.int64[::1], types.int64, types.int64,
+    types.uint64(
+        _POINTER, _POINTER, _TARGET, _MASK, types.boolean, _MASK,
+        types.int64, types.int32[::1], types.int64[::1], types.uint64, types.uint64,
     ),
     cache=True,
     nogil=True,
 )  # fmt: skip
-def _sweep(pair_pointer, pointer, target, alive, front, below, level, pair, first, last):  # type: ignore[no-untyped-def]
+def _sweep(pair_pointer, pointer, target, alive, all_alive, front, below, level, pair, first, last):  # type: ignore[no-untyped-def]
     """Put on level ``below + 1`` the cells first..last-1 without level that can enter the front.
 
     Returns the number of entries visited. ``front`` is the cells on level ``below``.
     """
-    visits = 0
+    visits = np.uint64(0)
     for i in range(first, last):
         if level[i] >= 0:
             continue
-        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+        begin, end = pair_pointer[i], pair_pointer[i + ONE]
+        if all_alive:  # all entries of the cell at once: most cells of most sweeps do not enter
+            enters = False
+            for e in range(pointer[begin], pointer[end]):
+                enters |= front[target[e]]
+            visits += pointer[end] - pointer[begin]
+            if not enters:
+                continue
+        for k in range(begin, end):
             if not alive[k]:
                 continue
             enters = False
-            for e in range(pointer[k], pointer[k + 1]):
+            for e in range(pointer[k], pointer[k + ONE]):
                 enters |= front[target[e]]
-            visits += pointer[k + 1] - pointer[k]
+            visits += pointer[k + ONE] - pointer[k]
             if enters:
                 level[i], pair[i] = below + 1, k
                 break
