@@ -9,6 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
+from lmdsl.sweeps import ONE
+
 
 @njit(cache=True, nogil=True)
 def merge(  # type: ignore[no-untyped-def]
@@ -42,7 +44,8 @@ def merge(  # type: ignore[no-untyped-def]
     pairs, entries : int
         How many were written.
     """
-    pairs = entries = 0
+    pairs = entries = np.uint64(0)
+    down, right = np.uint64(len(mean) > 1), np.uint64(mean.shape[1] > 1)
     cells = len(per_cell)
     controls = index.shape[0] * index.shape[2] // cells
     high, wide = tile(cells_last, controls)
@@ -51,17 +54,17 @@ def merge(  # type: ignore[no-untyped-def]
             c1, a1 = min(c0 + high, cells), min(a0 + wide, controls)
             _keys(index, cells_last, c0, c1, a0, a1, number, group, bits, key)
             _sort(key, (c1 - c0) * (a1 - a0))
-            k = 0
+            k = np.uint64(0)
             for c in range(c0, c1):
                 for a in range(a0, a1):
                     if key[0, k] >= 0:  # a sample that leaves has a negative key, now the first
                         entries = _row(key, k, bits, first_code, entries, target, code)
                         i, j = (a, c) if cells_last else (c, a)
-                        cost[pairs] = mean[min(i, len(mean) - 1), min(j, mean.shape[1] - 1)]
+                        cost[pairs] = mean[down * np.uint64(i), right * np.uint64(j)]
                         control[pairs], end[pairs] = a, entries
                         per_cell[c] += 1
-                        pairs += 1
-                    k += 1
+                        pairs += ONE
+                    k += ONE
     return pairs, entries
 
 
@@ -136,16 +139,17 @@ def _row(key, k, bits, first_code, entries, target, code):  # type: ignore[no-un
     Every sample overwrites the last entry or begins the next: no branch that depends on the keys.
     """
     mask = (1 << bits) - 1
-    last = key[0, k]
-    count = first_code[last & mask]
+    last = key[np.uint64(0), k]
+    count = first_code[np.uint64(last & mask)]
     target[entries], code[entries] = last >> bits, count
-    for s in range(1, len(key)):
+    for s in range(ONE, np.uint64(len(key))):
         here = key[s, k]
-        count = count + 1 if here == last else first_code[here & mask]
-        entries += 0 if here == last else 1
+        same = here == last
+        count = count + 1 if same else first_code[np.uint64(here & mask)]
+        entries += np.uint64(not same)
         target[entries], code[entries] = here >> bits, count
         last = here
-    return entries + 1
+    return entries + ONE
 
 
 @njit(

@@ -19,7 +19,7 @@ from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.program import Program
 
-CHUNK = 2**16
+CHUNK = 2**17
 """Samples evaluated at a time: few enough to stay in cache, many enough to keep threads apart."""
 
 Floats = NDArray[np.float64]

@@ -28,9 +28,9 @@ systems.*
 systems
 declarations
 problem
-sampling memory threads merging
+sampling memory threads
 sweeps
-peeling
+peeling merging
 linear
 partition rows
 boxes
