@@ -32,6 +32,8 @@ Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 MEASURE_TOLERANCE = 1e-9
+MANY = 10_000
+"""Cells from which on two claims are judged in two threads."""
 CLAIMS = ("stabilizing", "upper_bound", "lower_bound", "measure")
 
 
@@ -194,7 +196,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
         def of_measure() -> float | None:
             return None if mu is None else check_measure(under, own, mu)
 
-        claims, residual = threads.both(of_policy, of_measure)
+        claims, residual = threads.both(of_policy, of_measure, lp.n >= MANY)
         contraction, upper = claims
     lower = W is not None and check_lower(lp, W)
     if upper and V_up is not None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lmdsl import bounds, linear, policy, threads
 from lmdsl.certificate import (
+    MANY,
     MEASURE_TOLERANCE,
     Verified,
     Witness,
@@ -83,7 +84,7 @@ def _first_try(
         return _measure_vector(under, rows)
 
     if value is not None:  # then the measure is finite too
-        (witness, V), mu = threads.both(bounds_of_cost, measure)
+        (witness, V), mu = threads.both(bounds_of_cost, measure, lp.n >= MANY)
     else:
         witness, V = bounds_of_cost()
         mu = None if V is None else measure()
