@@ -122,7 +122,7 @@ class Iteration:
     converged
         False when stopped early.
     screen
-        Lower bounds of every Q at the value.
+        Lower bounds of the rivals of each cell's control at the value.
     """
 
     pair: Pairs
@@ -253,7 +253,7 @@ def canonical(
     lp, pair, value
         The model, an optimal policy and its value.
     screen
-        Lower bounds of every Q at this value, where they are known.
+        Lower bounds of the rivals of each cell's control at this value, where they are known.
     """
     if screen is None:
         screen = Screen(lp)

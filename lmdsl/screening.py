@@ -1,11 +1,13 @@
-"""Improvement passes that leave out what earlier passes prove worse.
+"""Improvement passes that leave out cells where no other control can be better.
 
 Along a falling sequence of values V the Q of a pair falls too, but no faster than V does: if
-V' >= r V then gamma P_a V' + G_a >= r (gamma P_a V + G_a) for 0 < r <= 1, because G_a >= 0. So
-Q / scale, stored once, with the product of all ratios so far, bounds Q from below for ever; a pair
-whose bound exceeds what the cell has already needs no look at its row. Bounds are single precision,
-a millionth below what was computed: far more than all rounding. Late passes read one number a
-cell, no rows.
+V' >= r V then gamma P_a V' + G_a >= r (gamma P_a V + G_a) for 0 < r <= 1, because G_a >= 0. So the
+least Q among the rivals of a cell's control, divided by the product of all ratios before it was
+found, times that of all so far, bounds them from below for ever. A cell whose value is below that
+bound needs no look at its rows. Late passes read a few numbers a cell, no rows.
+
+A bound for every pair would leave out more rows, but takes longer than it saves: a processor reads
+all rows of a cell in less time than it takes to find out which of them to read.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 LEAST_SCALE = 1e-30
-MOST = np.float32(3e38)
+MOST = 1e308
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Pass:
 
 
 class Screen:
-    """Lower bounds of every Q, kept along a falling sequence of values.
+    """Lower bounds of the Q of the rivals of each cell's control, along a falling V.
 
     Parameters
     ----------
@@ -74,11 +76,11 @@ class Screen:
         self.lp = lp
         self.gamma = lp.gamma if gamma is None else gamma
         self.cost = lp.cost if cost is None else cost
-        self.least = np.zeros(lp.K, dtype=np.float32)
-        self.rival = np.zeros(lp.n, dtype=np.float32)
+        self.rival = np.zeros(lp.n)
         self.paid = np.empty(lp.n)
         self.scale = 1.0
         self.passes = 0
+        self.pair: Pairs | None = None  # whose rivals
 
     @cached_property
     def slots(self) -> Slots:
@@ -107,11 +109,12 @@ class Screen:
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(
                 *cells, lp.kernel[0], self.cost, x, own, margin, self.scale, backwards,
-                self.least, self.rival, value, new.view(np.uint64), self.paid, *slots,
+                self.rival, value, new.view(np.uint64), self.paid, *slots,
             )  # fmt: skip
             return int(changed), int(looked)
 
         counts = bellman.over_cells(lp, part, bellman.IN_PLACE)
+        self.pair = new
         return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
 
     def tied(
@@ -135,12 +138,14 @@ class Screen:
         lp = self.lp
         x, ties = bellman.padded(V), np.empty(lp.K, dtype=np.bool_)
         first, own = np.empty(lp.n, dtype=np.int64), pair.view(np.uint64)
+        known = self.pair is not None and np.array_equal(self.pair, pair)
+        rival = self.rival if known else np.zeros(lp.n)
 
         def part(cells: tuple[int, int]) -> bool:
             several = _ties(
                 *cells, *lp.kernel,
-                self.cost, self.gamma, x, tolerance, self.scale, self.least, own,
-                ties, first,
+                self.cost, self.gamma, x, tolerance, self.scale, rival, own, ties,
+                first,
             )  # fmt: skip
             return bool(several)
 
@@ -150,8 +155,7 @@ class Screen:
         """Note that V fell from ``before`` to ``after``."""
         self.scale *= float(_least_ratio(before, after)) * (1 - 1e-13)
         if self.scale < LEAST_SCALE:
-            self.least *= np.float32(self.scale)
-            self.rival *= np.float32(self.scale)
+            self.rival *= self.scale
             self.scale = 1.0
 
 
@@ -167,49 +171,35 @@ def _least_ratio(before, after):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _pass(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, cost, V, pair, margin, scale, backwards, least, rival, value, new,
-    paid, held, pointer, target, code, share, columns, gamma, begins, ends, indices, data, inverse,
+    first, last, pair_pointer, cost, V, pair, margin, scale, backwards, rival, value, new, paid,
+    held, pointer, target, code, share, columns, gamma, begins, ends, indices, data, inverse,
 ):  # fmt: skip
-    """Improve the cells of a range in turn; ``least`` gets the bounds of the rows that were read.
+    """Improve the cells of a range in turn; ``rival`` gets the bounds of those that were read.
 
-    V_i >= Q of the cell's own pair, so a pair whose bound exceeds V_i is no better; the own row is
-    read only where some rival remains. ``rival`` is the smallest bound of a cell's rivals.
+    V_i >= Q of the cell's own pair, so where the bound of the rivals is V_i or more none is better.
     """
     changed, looked = 0, np.uint64(0)
     first, last = np.uint64(first), np.uint64(last)
     x = V.copy()  # other ranges keep the values from before the pass
-    store, shrink = (1.0 - 1e-6) / scale, 1.0 / scale
-    candidate = np.empty(_most(first, last, pair_pointer), dtype=np.uint64)
+    store, shrink = (1.0 - 1e-12) / scale, 1.0 / scale
     for t in range(last - first):
         i = last - ONE - t if backwards else first + t
-        own, limit = pair[i], x[i] * shrink
+        own, begin, end = pair[i], pair_pointer[i], pair_pointer[i + ONE]
         new[i] = own
-        if rival[i] < limit:
-            # First a list without a branch, then a loop without one: a processor that guesses wrong
-            # which rows are read waits for memory.
-            begin, end = pair_pointer[i], pair_pointer[i + ONE]
-            count, rest = np.uint64(0), MOST
-            for d in range(end - begin):
-                k = end - ONE - d if backwards else begin + d
-                near = (least[k] < limit) | (k == own)
-                candidate[count] = k
-                count += np.uint64(near)
-                bound = MOST if near else least[k]
-                rest = bound if bound < rest else rest
+        if rival[i] < x[i] * shrink:
             own_q, best, second, choice = np.inf, np.inf, np.inf, own
-            for c in range(count):
-                k = candidate[c]
+            for k in range(begin, end):
                 q = 0.0
                 for e in range(pointer[k], pointer[k + ONE]):
                     q += share[code[e]] * x[target[e]]
                 q = gamma * q + cost[k]
-                least[k] = q * store if q * store < MOST else MOST
+                # No branch for the second: processors guess it wrong, at half of the time.
                 own_q = q if k == own else own_q
                 larger = q if q > best else best
                 second = larger if larger < second else second
                 if q < best:
                     best, choice = q, k
-            looked += count
+            looked += end - begin
             if choice != own:
                 if best < own_q - margin * abs(own_q):
                     changed += 1
@@ -218,7 +208,7 @@ def _pass(  # type: ignore[no-untyped-def]
                     second, best = best, own_q
             if best < x[i]:
                 x[i] = best
-            rival[i] = second * store if second * store < rest else rest
+            rival[i] = second * store if second * store < MOST else MOST
         if held[i] != new[i]:  # its row is at hand now
             held[i] = new[i]
             paid[i] = cost[new[i]]
@@ -232,51 +222,40 @@ def _pass(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _most(first, last, pair_pointer):  # type: ignore[no-untyped-def]
-    """Return the largest number of pairs of a cell."""
-    most = np.uint64(0)
-    for i in range(first, last):
-        most = max(most, pair_pointer[i + ONE] - pair_pointer[i])
-    return most
-
-
-@njit(cache=True, nogil=True)
 def _ties(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, tolerance, scale,
-    least, pair, ties, chosen,
+    rival, pair, ties, chosen,
 ):  # fmt: skip
     """Mark the tied columns of a range of cells: first Q_min, then all that come near.
 
-    Where the bounds leave only a cell's own pair, no row is read.
+    Where no rival comes near, no row is read.
     """
     several = False
     first, last = np.uint64(first), np.uint64(last)
-    most = _most(first, last, pair_pointer)
-    q, candidate = np.empty(most), np.empty(most, dtype=np.uint64)
+    most = np.uint64(0)
     for i in range(first, last):
-        own, limit = pair[i], V[i] * (1.0 + tolerance + 1e-9) / scale
-        count = np.uint64(0)
-        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
-            ties[k] = False
-            candidate[count] = k
-            count += np.uint64((least[k] <= limit) | (k == own))
-        if count == ONE:
-            ties[own], chosen[i] = True, own
+        most = max(most, pair_pointer[i + ONE] - pair_pointer[i])
+    q = np.empty(most)
+    for i in range(first, last):
+        begin, end = pair_pointer[i], pair_pointer[i + ONE]
+        if rival[i] * scale > V[i] * (1.0 + tolerance + 1e-9):
+            for k in range(begin, end):
+                ties[k] = k == pair[i]
+            chosen[i] = pair[i]
             continue
         best = np.inf
-        for c in range(count):
-            k, q_k = candidate[c], 0.0
+        for k in range(begin, end):
+            q_k = 0.0
             for e in range(pointer[k], pointer[k + ONE]):
                 q_k += share[code[e]] * V[target[e]]
-            q[c] = gamma * q_k + cost[k]
-            best = min(best, q[c])
-        tied, chosen[i] = 0, -1
-        for c in range(count):
-            k = candidate[c]
-            if q[c] <= best + tolerance * abs(best) or k == own:
-                ties[k] = True
-                tied += 1
+            q[k - begin] = gamma * q_k + cost[k]
+            best = min(best, q[k - begin])
+        count, chosen[i] = 0, -1
+        for k in range(begin, end):
+            ties[k] = (q[k - begin] <= best + tolerance * abs(best)) | (k == pair[i])
+            if ties[k]:
+                count += 1
                 if chosen[i] < 0:
                     chosen[i] = k
-        several |= tied > 1
+        several |= count > 1
     return several

@@ -129,7 +129,7 @@ def solve(
             progress("solve", -1.0)
         solution = _asked(lp, chosen, options)
     outcome = _polish(lp, solution, first.pair, tolerance, late)
-    solution = replace(solution, details={})  # bounds of every Q would take memory till the end
+    solution = replace(solution, details={})  # the rows of its last policy would stay till the end
     job.solve_seconds = time.perf_counter() - started
     if progress:
         progress("verify", -1.0)

@@ -86,8 +86,8 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     )  # cells may be lost
     # Samples and images of every axis, and the intermediate arrays of a formula.
     blocks = (2 * len(problem.state_box) + 10) * 8 * max(CHUNK, S) * threads.count()
-    # Of a pair a bound of its Q; of a cell vectors, and the rows of a policy in doubles.
-    solving = pairs * 5 + 120 + 24 * pilot.entries
+    # Of a pair whether it ties; of a cell vectors, and the rows of a policy in doubles.
+    solving = pairs + 130 + 24 * pilot.entries
     grids = M * 8 * (1 + len(problem.control_grid)) + S * (8 * len(problem.state_box) + 200)
     return int(min(model + max(N * copied + blocks, N * solving) + grids, 1e30))
 
