@@ -17,6 +17,9 @@ Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
+NEAR = 64
+"""Largest level up to which a few passes from the levels may make a stabilizing policy."""
+
 
 @dataclass(frozen=True)
 class Feasible:
@@ -72,7 +75,7 @@ def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused |
     """Find a policy that is stabilizing with weight g = max(gamma, 1), or a proof against it.
 
     Candidates are the greedy policies of value iteration under unit cost from the levels of
-    Algorithm 1, which lie below it, then optimal policies under unit cost at gamma = 1 - 1/h, at
+    Algorithm 1, which lie below it, where these are few, then optimal policies under unit cost at gamma = 1 - 1/h, at
     which no policy costs more than h. Where none does, gamma is raised in steps, each below the
     limit of the last policy (unit cost, because under a cost with zeros this can stall).
     """
@@ -91,7 +94,7 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
     g = lp.growth
     level, pair = lp.tree
     V = level.astype(np.float64)
-    for k in range(4):
+    for k in range(4 if level.max() <= NEAR else 0):
         better = bellman.rise(lp, V, g, k % 2 == 1)
         V = better.value
         w = _proved(lp, better.pair, V) if k in (0, 3) else None
