@@ -75,9 +75,10 @@ def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused |
     """Find a policy that is stabilizing with weight g = max(gamma, 1), or a proof against it.
 
     Candidates are the greedy policies of value iteration under unit cost from the levels of
-    Algorithm 1, which lie below it, where these are few, then optimal policies under unit cost at gamma = 1 - 1/h, at
-    which no policy costs more than h. Where none does, gamma is raised in steps, each below the
-    limit of the last policy (unit cost, because under a cost with zeros this can stall).
+    Algorithm 1, which lie below it, where these are few, then optimal policies under unit cost at
+    gamma = 1 - 1/h, at which no policy costs more than h. Where none does, gamma is raised in
+    steps, each below the limit of the last policy (unit cost, because under a cost with zeros this
+    can stall).
     """
     reached: Feasible | Refused | Undecided = Undecided(lp.tree[1], 0.0)
     try:
