@@ -170,12 +170,13 @@ def lower_vector(lp: StabilizationLP, V: Floats | None, tolerance: float) -> Flo
 
 
 def _guessed(under: StabilizationLP, V: Floats, tolerance: float) -> Floats | None:
-    """W = (1 - eps) V, with eps G_u far above what rounding takes from V and from the check."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = float(np.where(V > 0, V / under.cost, 0.0).max(initial=0.0))
-    # Rows have at most as many entries as there are codes.
-    eps = 8 * (len(under.rows.shares.value) + 12) * bounds.UNIT * share
-    return V * (1 - eps) if eps < min(tolerance / 4, MOST_GUESSED) else None
+    """W = (1 - eps) V with what rounding takes from the policy's own rows, twice; rarely too small.
+
+    Other rows as close to V have about as many entries and as much cost.
+    """
+    worst, stuck = bounds.worst_excess(under, V)
+    eps = 2 * worst + bounds.UNIT
+    return None if stuck or not eps < min(tolerance / 4, MOST_GUESSED) else V * (1 - eps)
 
 
 def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
