@@ -13,6 +13,7 @@ is still solved to its own precision. Whether an answer is good enough is judged
 
 from __future__ import annotations
 
+import threading
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -33,6 +34,9 @@ DENSE = 50
 KRYLOV, KRYLOV_STEPS = 1000, 200
 PER_CORE = 20
 """The core may be swept more often than all cells, up to so many times."""
+
+_filtering = threading.Lock()
+"""Filters of warnings belong to the process: one thread at a time changes and restores them."""
 
 Stop = Callable[[], bool]
 
@@ -341,7 +345,7 @@ def _factors(inner: Any) -> Callable[[Floats], Floats]:
     from scipy.sparse import eye_array
     from scipy.sparse.linalg import splu
 
-    with warnings.catch_warnings():
+    with _filtering, warnings.catch_warnings():
         warnings.simplefilter("error")
         solver: Callable[[Floats], Floats] = splu(
             (eye_array(inner.shape[0], format="csr") - inner).tocsc()

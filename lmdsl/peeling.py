@@ -3,7 +3,7 @@
 A policy leads most cells to the attractor without ever passing through the same cell again. Cells
 that no other cell leads to are taken away, then those that only these lead to, and so on, level by
 level (Kahn's algorithm). No cell leads to another of its level, so a large level is solved in
-several threads; the cells of a level ascend, which keeps memory close. What is left, the core,
+several threads; its cells ascend, which keeps memory close. What is left, the core,
 holds every cycle (staying put is no cycle here) and all that cycles lead to; nothing in it depends
 on the cells taken away. So x = b + M x is solved on the core, then the others follow in the reverse
 order, each from cells already known. The transposed system, which a measure satisfies, goes the
@@ -13,6 +13,7 @@ other way: mass flows down to the core, which is solved last.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -26,7 +27,7 @@ Cells = NDArray[np.uint32]
 
 MANY, PARTS = 40_000, 8
 """Cells of a level that are worth several threads, and into how many ranges they are split."""
-WORD, BYTE = np.uint64(64), np.uint64(8)
+WORD, BYTE, FAR = np.uint64(64), np.uint64(8), np.uint64(8)
 
 
 @dataclass(frozen=True)
@@ -88,25 +89,30 @@ class Peeled:
             cells = self.order[span[0] : span[1]]
             return bool(_back(cells, s.begin, s.end, s.indices, s.data, s.inverse, b, x))
 
-        last = len(self.order)
-        while last:
-            first = self._before(last)
-            if last - first < MANY:
-                while first and first - self._before(first) < MANY:
-                    first = self._before(first)
-                found = part((first, last))
+        for first, last, large in reversed(self._spans):
+            if large:
+                ends = threads.ranges(last - first, PARTS)
+                found = all(threads.each(part, [(first + i, first + k) for i, k in ends]))
             else:
-                spans = [(first + i, first + k) for i, k in threads.ranges(last - first, PARTS)]
-                found = all(threads.each(part, spans))
+                found = part((first, last))
             if not found:
                 return False
-            last = first
         return True
 
-    def _before(self, end: int) -> int:
-        """Return where the level begins that ends at ``end``."""
-        k = int(np.searchsorted(self.levels, end))
-        return int(self.levels[k - 1]) if k else 0
+    @cached_property
+    def _spans(self) -> list[tuple[int, int, bool]]:
+        """Large levels, and what lies between them, as ranges of ``order``."""
+        starts = np.concatenate([[0], self.levels[:-1]]).astype(np.int64)
+        spans, at = [], 0
+        for k in np.flatnonzero(self.levels - starts[: len(self.levels)] >= MANY):
+            first, last = int(starts[k]), int(self.levels[k])
+            if first > at:
+                spans.append((at, first, False))
+            spans.append((first, last, True))
+            at = last
+        if at < len(self.order):
+            spans.append((at, len(self.order), False))
+        return spans
 
     def flow(self, x: Floats) -> bool:
         """Solve x = b + M'x outside the core in place, for x = b on entry.
@@ -147,6 +153,14 @@ def _peel(begin, end, indices, order, ends):  # type: ignore[no-untyped-def]
                 word = j // WORD
                 free[word] |= np.uint64(left == 0) << (j % WORD)
                 low, high = min(low, word), max(high, word)
+                order[count] = j
+                count += np.uint64(left == 0)
+        if low <= high and high - low > FAR * (count - last):  # few, far apart: as they came
+            for t in range(last, count):
+                free[order[t] // WORD] = np.uint64(0)
+            low, high = np.uint64(1), np.uint64(0)
+        else:
+            count = last
         for w in range(low, high + ONE):
             bits, first = free[w], np.uint64(w) * WORD
             free[w] = np.uint64(0)

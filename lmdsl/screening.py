@@ -77,7 +77,7 @@ class Screen:
         self.gamma = lp.gamma if gamma is None else gamma
         self.cost = lp.cost if cost is None else cost
         self.rival = np.zeros(lp.n)
-        self.paid = np.empty(lp.n)
+        self.paid = np.full(lp.n, np.nan)
         self.scale = 1.0
         self.passes = 0
         self.pair: Pairs | None = None  # whose rivals
@@ -105,6 +105,8 @@ class Screen:
         x, backwards = bellman.padded(V), self.passes % 2 == 1
         self.passes += 1
         own, slots = pair.view(np.uint64), self.slots.kernel
+        if self.pair is not None and self.pair is not pair:
+            self.rival[self.pair != pair] = 0.0
 
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(

@@ -306,7 +306,8 @@ def _tidied(
         limit = (1 + tolerance / 4) * certificate.weighted(lp, done.value)
         if tidy_value is not None and certificate.weighted(lp, tidy_value) <= limit:
             return _Outcome(tidy, tidy_value, steps, gap_before)
-    return _Outcome(done.pair, done.value, steps, gap_before)
+    value = done.value if done.converged else None  # else perhaps only a bound of it
+    return _Outcome(done.pair, value, steps, gap_before)
 
 
 def _usable(lp: StabilizationLP, pair: Pairs, guess: NDArray[np.float64] | None) -> bool:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import dense, random_lp
 from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu, spsolve
 
 from lmdsl import linear, peeling, rows, threads
 from lmdsl.peeling import Peeled
@@ -52,7 +55,6 @@ def test_core_is_closed_and_holds_every_cycle(seed, n, cyclic):
     assert ends[-1] == len(peeled.order)
     for first, last in pairwise(ends):
         level = peeled.order[first:last]
-        assert (np.diff(level.astype(int)) > 0).all()
         assert not off[np.ix_(level, level)].any()
     for i in peeled.order:
         assert (place[np.flatnonzero(off[i])] > place[i]).all()
@@ -93,6 +95,30 @@ def test_advancing_stays_on_its_side(seed, n, cyclic):
         else:
             assert (x <= before * (1 + 1e-13)).all()
             assert (x >= ahead * (1 - 1e-13)).all()
+
+
+def test_cells_of_a_level_ascend_where_they_are_not_few_and_far_apart():
+    n = 5000
+    chains = np.arange(0, n, 100)  # 50 chains of 100 cells: each level has cells all over
+    step = np.where(np.arange(n - 1) % 100 < 99, 0.5, 0.0)
+    peeled = Peeled.of(System.of(sp.csr_array(np.diag(step, 1))))
+    np.testing.assert_array_equal(peeled.levels, 50 * np.arange(1, 101))
+    np.testing.assert_array_equal(peeled.order.reshape(100, 50), chains + np.arange(100)[:, None])
+
+
+def test_a_walk_in_from_both_ends_is_peeled_pair_by_pair():
+    n = 4001
+    i = np.arange(n)
+    step = np.sign(n // 2 - i)
+    go = step != 0
+    M = sp.csr_array((np.full(go.sum(), 0.5), (i[go], (i + step)[go])), shape=(n, n))
+    peeled, b = Peeled.of(System.of(M)), np.random.default_rng(0).random(n)
+    assert not len(peeled.core)
+    assert len(peeled.levels) == n // 2 + 1
+    assert len(peeled._spans) == 1  # one sweep, however many levels
+    x = np.zeros(n)
+    assert peeled.substitute(b, x)
+    np.testing.assert_allclose(x - M @ x, b, rtol=1e-13)
 
 
 @pytest.mark.parametrize("many", [1, 4, 1000])
@@ -158,6 +184,22 @@ def test_well_mixed_systems_are_solved_without_factors(monkeypatch, zeros, scale
     np.testing.assert_allclose(linear.solve(M, b), exact, rtol=1e-9)
     mu = linear.solve_transposed(Peeled.of(System.of(M)), b, lambda: M)
     np.testing.assert_allclose(mu - M.T @ mu, b, atol=1e-11 * mu.max())
+
+
+def test_factors_in_several_threads_leave_the_filters_of_warnings_alone(monkeypatch):
+    M, delays = well_mixed(30, 0.1), iter([0.05, 0.1, 0.15])
+
+    def slow(A):
+        time.sleep(next(delays))
+        return splu(A)
+
+    monkeypatch.setattr("scipy.sparse.linalg.splu", slow)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        before = list(warnings.filters)
+        with ThreadPoolExecutor(3) as pool:
+            list(pool.map(lambda _: linear._factors(M), range(3)))
+        assert list(warnings.filters) == before
 
 
 def test_a_well_mixed_system_that_grows_has_no_solution():
