@@ -96,7 +96,8 @@ class Screen:
         Parameters
         ----------
         V, pair
-            Values, shape (n,), and the policy, a column per cell.
+            Values, shape (n,), and the policy, a column per cell: V >= T_u V. So a policy other
+            than that of the last pass is looked at wherever it differs, as one of its rivals.
         margin
             Q < Q_u - margin |Q_u| counts as better.
         """
@@ -105,8 +106,6 @@ class Screen:
         x, backwards = bellman.padded(V), self.passes % 2 == 1
         self.passes += 1
         own, slots = pair.view(np.uint64), self.slots.kernel
-        if self.pair is not None and self.pair is not pair:
-            self.rival[self.pair != pair] = 0.0
 
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(

@@ -45,6 +45,13 @@ def models():
         yield random_lp(np.random.default_rng(seed))
 
 
+def rivals(lp, pair, V):
+    """Return the least Q among the other controls of each cell."""
+    Q = lp.gamma * (lp.rows.matrix() @ V) + lp.cost
+    others = np.where(np.arange(lp.K) == pair[lp.cell], np.inf, Q)
+    return np.minimum.reduceat(others, lp.pair_pointer[:-1])
+
+
 def paths():
     """Shortest paths with small integers as costs: many ties."""
     for seed in range(6):
@@ -81,10 +88,7 @@ def test_passes_agree_with_numpy_and_bounds_hold(monkeypatch, ranges):
             left_out += lp.K - done.looked
             screen.follow(V, done.value)
             pair, V = done.pair, done.value
-            Q = lp.gamma * (lp.rows.matrix() @ V) + lp.cost
-            others = np.where(np.arange(lp.K) == pair[lp.cell], np.inf, Q)
-            rivals = np.minimum.reduceat(others, lp.pair_pointer[:-1])
-            assert (screen.rival * screen.scale <= rivals).all()
+            assert (screen.rival * screen.scale <= rivals(lp, pair, V)).all()
     assert left_out > 100
 
 
@@ -104,3 +108,17 @@ def test_ties_are_those_of_a_pass_over_all_rows():
             assert more == (ties.sum() > lp.n)
         several += more
     assert several
+
+
+def test_bounds_hold_for_a_policy_the_last_pass_did_not_choose():
+    changed = 0
+    for lp in models():
+        if (start := begun(lp)) is None:
+            continue
+        pair, V = start
+        screen = Screen(lp)
+        changed += screen.improve(V, pair, MARGIN).changed
+        done = screen.improve(V, pair, MARGIN)  # the policy from before that pass
+        screen.follow(V, done.value)
+        assert (screen.rival * screen.scale <= rivals(lp, done.pair, done.value)).all()
+    assert changed
