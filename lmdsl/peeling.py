@@ -3,11 +3,11 @@
 A policy leads most cells to the attractor without ever passing through the same cell again. Cells
 that no other cell leads to are taken away, then those that only these lead to, and so on, level by
 level (Kahn's algorithm). No cell leads to another of its level, so a large level is solved in
-several threads; its cells ascend, which keeps memory close. What is left, the core,
-holds every cycle (staying put is no cycle here) and all that cycles lead to; nothing in it depends
-on the cells taken away. So x = b + M x is solved on the core, then the others follow in the reverse
-order, each from cells already known. The transposed system, which a measure satisfies, goes the
-other way: mass flows down to the core, which is solved last.
+several threads; its cells ascend, which keeps memory close. What is left, the core, holds every
+cycle (staying put is no cycle here) and all that cycles lead to; nothing in it depends on the cells
+taken away. So x = b + M x is solved on the core, then the others follow in the reverse order, each
+from cells already known. The transposed system, which a measure satisfies, goes the other way: mass
+flows down to the core, which is solved last.
 """
 
 from __future__ import annotations
@@ -27,7 +27,11 @@ Cells = NDArray[np.uint32]
 
 MANY, PARTS = 40_000, 8
 """Cells of a level that are worth several threads, and into how many ranges they are split."""
-WORD, BYTE, FAR = np.uint64(64), np.uint64(8), np.uint64(8)
+
+WORD, BYTE = np.uint64(64), np.uint64(8)
+
+FAR = np.uint64(8)
+"""Words between the first and last cell of a level, for each cell: with more it is not sorted."""
 
 
 @dataclass(frozen=True)

@@ -181,7 +181,7 @@ def iterate(
             else:
                 x = x.copy()
                 sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
-                rows = Peeled.of(screen.slots.system(done.pair))
+                rows = Peeled.of(screen.slots.held)  # the pass copied them
                 fall = 0.0 if rows.small else _fall(V, x)
                 left = linear.advance(rows, screen.paid, x, sweeps, 0.1 * fall, 0.0)
                 paid = bool((screen.paid > 0).all())  # else what is free has to become 0

@@ -8,7 +8,7 @@ import scipy.sparse as sp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import bellman, linear, rows, sweeps, threads
+from lmdsl import bellman, certificate, linear, peeling, rows, sweeps, threads, witness
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -17,7 +17,8 @@ def test_ranges_and_halves_give_the_same_policy(monkeypatch, workers):
     whole = lm.solve(problem)
     monkeypatch.setattr(bellman, "GRAIN", 1)
     monkeypatch.setattr(sweeps, "SPLIT", 1)
-    monkeypatch.setattr(rows, "MANY", 1)
+    for room in (rows, peeling, certificate, witness):
+        monkeypatch.setattr(room, "MANY", 1)
     monkeypatch.setattr(threads, "count", lambda: workers)
     parts = lm.solve(problem)
     assert parts.status == whole.status == "verified"

@@ -85,6 +85,8 @@ def test_passes_agree_with_numpy_and_bounds_hold(monkeypatch, ranges):
             np.testing.assert_allclose(done.value, x, rtol=1e-13)
             np.testing.assert_array_equal(done.pair, new)
             assert done.changed == (new != pair).sum()
+            np.testing.assert_array_equal(screen.slots.chosen, new)
+            np.testing.assert_array_equal(screen.paid, lp.cost[new])
             left_out += lp.K - done.looked
             screen.follow(V, done.value)
             pair, V = done.pair, done.value
