@@ -58,13 +58,12 @@ def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
     Where its own value is soon known and every cost positive, it is the proof; else the guess is
     swept towards the unit-cost value for a while.
     """
-    under, own = lp.under(pair), np.arange(lp.n)
-    rows = peeled(under, own, lp.growth)
-    paid = rows.small and bool((under.cost > 0).all())
-    for cost in (under.cost, np.ones(lp.n)) if paid else (np.ones(lp.n),):
+    rows, cost = peeled(lp, pair, lp.growth), lp.cost[pair]
+    paid = rows.small and bool((cost > 0).all())
+    for paid_for in (cost, np.ones(lp.n)) if paid else (np.ones(lp.n),):
         proof = w.copy()
-        left = linear.advance(rows, cost, proof, MOST_SWEEPS, 0.0, 0.25)
-        if bounds.decrease(under, own, proof, lp.growth) is not None:
+        left = linear.advance(rows, paid_for, proof, MOST_SWEEPS, 0.0, 0.25)
+        if bounds.decrease(lp, pair, proof, lp.growth) is not None:
             return proof
         if left == np.inf:
             break

@@ -223,19 +223,19 @@ def bound(lp: StabilizationLP, pair: Pairs, w: Floats | None = None) -> Floats |
 
     With w >= g P_u w + d, c w serves as soon as c d >= G_u; sweeps then lower it.
     """
-    under, own = lp.under(pair), np.arange(lp.n)
-    w, d = stability_vector(under, own, w)
+    w, d = stability_vector(lp, pair, w)
     if w is None or d is None:
         return None
+    cost = lp.cost[pair]
     with np.errstate(over="ignore"):
-        factor = float((under.cost / d).max()) * (1 + 1e-12)
+        factor = float((cost / d).max()) * (1 + 1e-12)
         V: Floats = w * factor
     if not (V < CEILING).all():
         return None
-    if lp.gamma == lp.growth and bool((d * (factor * (1 - 1e-2)) <= under.cost).all()):
+    if lp.gamma == lp.growth and bool((d * (factor * (1 - 1e-2)) <= cost).all()):
         return V  # within a percent of the value already
     x = V.copy()
-    linear.advance(peeled(under, own, lp.gamma), under.cost, x, MOST_SWEEPS, 1e-2, 0.0)
+    linear.advance(peeled(lp, pair, lp.gamma), cost, x, MOST_SWEEPS, 1e-2, 0.0)
     return np.minimum(x, V)
 
 
@@ -323,8 +323,9 @@ def stability_vector(
         d = bounds.decrease(lp, pair, w, g)
         if d is not None:
             return w, d
+    units = np.broadcast_to(1.0, lp.K)  # takes no memory
     for inflation in (0.0, 5e-7, 1e-10):
-        w_more = evaluate(lp, pair, g * (1 + inflation), np.ones(lp.K), guess, stop=stop)
+        w_more = evaluate(lp, pair, g * (1 + inflation), units, guess, stop=stop)
         if w_more is not None and (d := bounds.decrease(lp, pair, w_more, g)) is not None:
             return w_more, d
     return None, None

@@ -188,20 +188,23 @@ def _pass(  # type: ignore[no-untyped-def]
         own, begin, end = pair[i], pair_pointer[i], pair_pointer[i + ONE]
         new[i] = own
         if rival[i] < x[i] * shrink:
-            own_q, best, second, choice = np.inf, np.inf, np.inf, own
+            best, second, choice = np.inf, np.inf, own
             for k in range(begin, end):
                 q = 0.0
                 for e in range(pointer[k], pointer[k + ONE]):
                     q += share[code[e]] * x[target[e]]
                 q = gamma * q + cost[k]
                 # No branch for the second: processors guess it wrong, at half of the time.
-                own_q = q if k == own else own_q
                 larger = q if q > best else best
                 second = larger if larger < second else second
                 if q < best:
                     best, choice = q, k
             looked += end - begin
             if choice != own:
+                own_q = 0.0  # once more: to watch out for it in the loop takes longer
+                for e in range(pointer[own], pointer[own + ONE]):
+                    own_q += share[code[e]] * x[target[e]]
+                own_q = gamma * own_q + cost[own]
                 if best < own_q - margin * abs(own_q):
                     changed += 1
                     new[i] = choice
