@@ -122,7 +122,7 @@ class Partition:
         """
         saturate = self.clip if clip is None else clip
         total: Floats | None = None
-        for axis, image in zip(self._axes, images, strict=True):
+        for axis, image in zip(self.axes, images, strict=True):
             x = np.asarray(image, dtype=np.float64)
             if total is None or x.shape == total.shape:
                 total = axis.add_index(x, saturate, total)
@@ -131,9 +131,10 @@ class Partition:
         return np.zeros(()) if total is None else total
 
     @cached_property
-    def _axes(self) -> tuple[_Axis, ...]:
+    def axes(self) -> tuple[Axis, ...]:
+        """The axes in plain numbers."""
         return tuple(
-            _Axis(
+            Axis(
                 float(self.low[k]),
                 float(self.high[k]),
                 float(self.width[k]),
@@ -244,7 +245,7 @@ _IMAGE = types.Array(types.float64, 1, "C", readonly=True)
 _F, _OUT = types.float64, types.float64[::1]
 
 
-class _Axis(NamedTuple):
+class Axis(NamedTuple):
     """One axis in plain numbers; ``stride`` cells of the box lie between neighbours on it."""
 
     low: float
@@ -262,9 +263,9 @@ class _Axis(NamedTuple):
         found = np.zeros(image.shape) if total is None else total
         flat, line = np.ascontiguousarray(image).reshape(-1), found.reshape(-1)
         if self.periodic:
-            _circle(flat, self.low, self.width, self.cells, self.stride, line)
+            circle(flat, self.low, self.width, self.cells, self.stride, line)
         else:
-            _interval(flat, self.low, self.high, self.width, self.cells, self.stride, clip, line)
+            interval(flat, self.low, self.high, self.width, self.cells, self.stride, clip, line)
         return found
 
 
@@ -272,7 +273,7 @@ class _Axis(NamedTuple):
 @njit(
     types.void(_IMAGE, _F, _F, _F, _F, _OUT), cache=True, nogil=True, error_model="numpy"
 )  # division by zero cannot occur, and its test would be a branch
-def _circle(image, low, width, cells, stride, index):  # type: ignore[no-untyped-def]
+def circle(image, low, width, cells, stride, index):  # type: ignore[no-untyped-def]
     """Add stride (k mod cells), k = floor((x - low)/width + EDGE); NaN where k is not finite.
 
     For |k| < 2^51 the quotient floor(k/cells) is off by at most one, its multiple of cells and the
@@ -301,7 +302,7 @@ def _circle(image, low, width, cells, stride, index):  # type: ignore[no-untyped
     nogil=True,
     error_model="numpy",
 )
-def _interval(image, low, high, width, cells, stride, clip, index):  # type: ignore[no-untyped-def]
+def interval(image, low, high, width, cells, stride, clip, index):  # type: ignore[no-untyped-def]
     """Add stride k, k = floor((x - low)/width + EDGE), for 0 <= k < cells; NaN elsewhere.
 
     An image up to EDGE above the last cell belongs to it. With ``clip`` a finite image is moved

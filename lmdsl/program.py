@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -13,11 +14,13 @@ from lmdsl.formulas import IN_PLACE, OPERATIONS, Formula, Step, fold
 from lmdsl.jets import Jet, apply
 
 
-class _Instruction(NamedTuple):
+class Instruction(NamedTuple):
+    """An operation on slots; ``released`` are those that nothing reads any more."""
+
     operation: str
     operands: tuple[int, ...]
     target: int
-    released: tuple[int, ...] = ()  # slots that nothing reads any more
+    released: tuple[int, ...] = ()
     reusable: tuple[int, ...] = ()  # those of them that may hold the result
 
 
@@ -34,8 +37,14 @@ class Program:
 
     Attributes
     ----------
+    formulas
+        The formulas.
     names
         The names that a call must give values for.
+    variables, template
+        The slot of each of them; of every slot its value where it is constant, else None.
+    instructions, outputs
+        What a call does, and the slots of its results.
     operations
         The operations of one call in order, for inspection.
     effort
@@ -43,24 +52,25 @@ class Program:
     """
 
     def __init__(self, formulas: Sequence[Formula], constants: Mapping[str, float] = {}) -> None:
+        self.formulas: tuple[Formula, ...] = tuple(formulas)
         self._slots: dict[tuple[object, ...], int] = {}
-        self._template: list[float | None] = []  # by slot: a constant, None for what varies
-        self._outputs: list[int] = []
-        instructions: list[_Instruction] = []
+        self.template: list[float | None] = []  # by slot: a constant, None for what varies
+        self.outputs: list[int] = []
+        instructions: list[Instruction] = []
         for formula in formulas:
             placed: list[int] = []
             for step in formula.steps:
                 key, value = self._identify(step, [placed[k] for k in step.operands], constants)
-                slot = self._slots.setdefault(key, len(self._template))
-                if slot == len(self._template):
-                    self._template.append(value)
+                slot = self._slots.setdefault(key, len(self.template))
+                if slot == len(self.template):
+                    self.template.append(value)
                     if value is None and step.operands:
-                        instructions.append(_Instruction(step.operation, key[1], slot))
+                        instructions.append(Instruction(step.operation, key[1], slot))
                 placed.append(slot)
-            self._outputs.append(placed[-1])
-        self._variables = {str(k[1]): s for k, s in self._slots.items() if k[0] == "name"}
-        self._instructions = self._with_lifetimes(instructions)
-        self.names = frozenset(self._variables)
+            self.outputs.append(placed[-1])
+        self.variables = {str(k[1]): s for k, s in self._slots.items() if k[0] == "name"}
+        self.instructions = self._with_lifetimes(instructions)
+        self.names = frozenset(self.variables)
         self.operations = tuple(step.operation for step in instructions)
         self.effort = max(len(instructions), 1)
 
@@ -68,7 +78,7 @@ class Program:
         self, step: Step, operands: Sequence[int], constants: Mapping[str, float]
     ) -> tuple[tuple[str, Any], float | None]:
         """Return a key, the same for steps with equal bits, and the value if constant."""
-        values = [value for k in operands if (value := self._template[k]) is not None]
+        values = [value for k in operands if (value := self.template[k]) is not None]
         if step.operation == "constant":
             value = step.value
         elif step.name in constants:
@@ -79,10 +89,10 @@ class Program:
             return (step.operation, step.name or tuple(operands)), None
         return ("constant", np.float64(value).tobytes()), value
 
-    def _with_lifetimes(self, instructions: Sequence[_Instruction]) -> list[_Instruction]:
-        live = set(self._outputs) | {k for k, v in enumerate(self._template) if v is not None}
-        inputs = set(self._variables.values())
-        marked: list[_Instruction] = []
+    def _with_lifetimes(self, instructions: Sequence[Instruction]) -> list[Instruction]:
+        live = set(self.outputs) | {k for k, v in enumerate(self.template) if v is not None}
+        inputs = set(self.variables.values())
+        marked: list[Instruction] = []
         for step in reversed(instructions):
             released = tuple(dict.fromkeys(k for k in step.operands if k not in live))
             live.update(step.operands)
@@ -90,6 +100,22 @@ class Program:
             reusable = tuple(k for k in released if in_place and k not in inputs)
             marked.append(step._replace(released=released, reusable=reusable))
         return marked[::-1]
+
+    def part(self, outputs: Sequence[int]) -> Program:
+        """Return the program that computes some of the slots, and nothing that they do not need."""
+        needed, kept = set(outputs), []
+        for step in reversed(self.instructions):
+            if step.target in needed:
+                needed.update(step.operands)
+                kept.append(step)
+        part = copy.copy(self)
+        part.outputs = list(outputs)
+        part.variables = {name: k for name, k in self.variables.items() if k in needed}
+        part.instructions = part._with_lifetimes(kept[::-1])
+        part.names, part.formulas = frozenset(part.variables), ()
+        part.operations = tuple(step.operation for step in part.instructions)
+        part.effort = max(len(part.instructions), 1)
+        return part
 
     def __call__(
         self, values: Mapping[str, NDArray[Any] | float]
@@ -110,19 +136,19 @@ class Program:
         if not self.names <= values.keys():
             missing = ", ".join(sorted(self.names.difference(values)))
             raise BadInput(f"no value is given for {missing}; give one for every name")
-        slots: list[Any] = list(self._template)
-        for name, slot in self._variables.items():
+        slots: list[Any] = list(self.template)
+        for name, slot in self.variables.items():
             slots[slot] = np.asarray(values[name], dtype=np.float64)
         with np.errstate(all="ignore"):
-            for operation, places, target, released, reusable in self._instructions:
+            for operation, places, target, released, reusable in self.instructions:
                 operands = [slots[k] for k in places]
                 room = _room(operands, [slots[k] for k in reusable]) if reusable else {}
                 slots[target] = OPERATIONS[operation](*operands, **room)
                 for k in released:
                     slots[k] = None
-        aliases = set(self._variables.values())
+        aliases = set(self.variables.values())
         results: list[NDArray[np.float64]] = []
-        for slot in self._outputs:  # no result shares memory with an input or another result
+        for slot in self.outputs:  # no result shares memory with an input or another result
             result = np.asarray(slots[slot], dtype=np.float64)
             results.append(result.copy() if slot in aliases else result)
             aliases.add(slot)
@@ -138,14 +164,14 @@ class Program:
         """
         directions = max((len(jet.slope.low) for jet in values.values()), default=0)
         slots: list[Any] = [
-            None if value is None else Jet.constant(value, directions) for value in self._template
+            None if value is None else Jet.constant(value, directions) for value in self.template
         ]
-        for name, slot in self._variables.items():
+        for name, slot in self.variables.items():
             slots[slot] = values[name]
         with np.errstate(all="ignore"):
-            for step in self._instructions:
+            for step in self.instructions:
                 slots[step.target] = apply(step.operation, [slots[k] for k in step.operands])
-        return tuple(slots[slot] for slot in self._outputs)
+        return tuple(slots[slot] for slot in self.outputs)
 
 
 def _room(operands: list[Any], reusable: list[Any]) -> dict[str, Any]:

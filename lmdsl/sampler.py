@@ -3,17 +3,20 @@
 Formulas and users' functions are evaluated on arrays that broadcast to (controls, points, nodes,
 cells), or (cells, points, nodes, controls) where there are more controls than cells. So what does
 not depend on the control is computed once for all controls, and NumPy's inner loops are long.
+Plain arithmetic with the control is done line by line instead (lines.py), to the same bits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import sampling
+from lmdsl.formulas import Formula
+from lmdsl.lines import Lines
 from lmdsl.merging import mean_cost
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
@@ -83,8 +86,9 @@ class Sampler:
         self.controls = sampling.control_vectors(problem)
         self.nodes = sampling.noise_nodes(problem)
         self.samples = len(self.points) * len(self.nodes.weights)
-        self.step = problem.step()
+        self.step, formulas = _step(problem)
         self.cost = Program([problem.cost()], problem.system.constants())
+        self._images, self._costs = _split(problem, formulas)
         self._offset = np.ascontiguousarray(self.points.T)[:, :, None]
         self._control = np.ascontiguousarray(self.controls.T)
         self._noise = {
@@ -119,6 +123,21 @@ class Sampler:
         named.update(self._noise)
         return named
 
+    def outcomes(self, block: Block) -> tuple[Floats, Floats]:
+        """Return :meth:`images` and :meth:`costs` of a block."""
+        values = self.values(block)
+        first, last = block.shape
+        shape = (first, len(self.points), len(self.nodes.weights), last)
+        index = mean = None
+        axes, clip, weights = self.partition.axes, self.partition.clip, self.nodes.weights
+        if self._images is not None:
+            paid = weights if self._costs is self._images else None
+            index, mean = self._images(values, shape, axes, clip, paid)
+        elif self._costs is not None:
+            _, mean = self._costs(values, shape, (), clip, weights)
+        index = self.images(block, values) if index is None else index
+        return index, self.costs(block, values) if mean is None else mean
+
     def images(self, block: Block, values: Mapping[str, Floats]) -> Floats:
         """Return the image cells, NaN where a sample leaves, shape (first, S, last)."""
         index = self.partition.index(self.step(values))
@@ -139,3 +158,28 @@ class Sampler:
         mean = np.zeros((cost.shape[0], cost.shape[3]))
         mean_cost(cost, len(self.points), self.nodes.weights, mean)
         return mean
+
+
+def _step(problem: Problem) -> tuple[Any, Sequence[Formula] | None]:
+    """Return the step and its formulas; None for a user's function, and where they are too long."""
+    step = problem.step()
+    formulas = getattr(step, "formulas", None)
+    if formulas is not None and not isinstance(step, Program):
+        step = Program(formulas, problem.system.constants())  # the same, with fewer arrays
+    return step, formulas
+
+
+def _split(
+    problem: Problem, formulas: Sequence[Formula] | None
+) -> tuple[Lines | None, Lines | None]:
+    """Return how images and costs are made line by line, one and the same for both if possible."""
+    constants, controls = problem.system.constants(), problem.controls
+
+    def lines(*parts: Formula) -> Lines | None:
+        return Lines.of(Program(parts, constants), controls)
+
+    cost = problem.cost()
+    if formulas is None:
+        return None, lines(cost)
+    both = lines(*formulas, cost)
+    return (both, both) if both is not None else (lines(*formulas), lines(cost))

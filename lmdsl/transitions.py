@@ -183,9 +183,7 @@ class _Assembler:
 
     def __call__(self, block: Block) -> tuple[Block, _BlockRows]:
         sampler, lanes = self.sampler, block.lanes
-        values = sampler.values(block)
-        index = sampler.images(block, values)
-        mean = sampler.costs(block, values)
+        index, mean = sampler.outcomes(block)
         per_cell = np.zeros(len(block.cells), dtype=np.int64)
         control, cost = np.empty(lanes, dtype=np.int32), np.empty(lanes)
         end = np.empty(lanes, dtype=np.int64)

@@ -21,7 +21,7 @@ files staging
 formulas
 intervals
 jets
-program
+program recording
 declared
 systems.base
 systems.*
@@ -33,7 +33,7 @@ sweeps
 peeling merging
 linear
 partition rows
-boxes
+boxes lines
 regions sampler
 local
 local_check

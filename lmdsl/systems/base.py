@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -18,9 +19,10 @@ from pydantic import Field, model_validator
 
 from lmdsl.declared import Count, Declared, Formulas, Number, Parameters
 from lmdsl.errors import BadInput, shown
-from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, parse
+from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, Formula, parse
 from lmdsl.jets import Jet
 from lmdsl.program import Program
+from lmdsl.recording import Recorder
 
 Array = NDArray[np.float64]
 Step = Callable[[Mapping[str, Any]], tuple[Array, ...]]
@@ -124,6 +126,10 @@ class OdeSystem(System):
         return _RungeKutta(field, tuple(states), self.step, self.substeps)
 
 
+MOST_WRITTEN = 1_000
+"""Operations up to which a step is written out."""
+
+
 class _RungeKutta:
     """x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4), repeated; h = step / substeps."""
 
@@ -137,6 +143,21 @@ class _RungeKutta:
         with np.errstate(all="ignore"):
             images: tuple[Array, ...] = self._advance(values, start, self.field)
         return images
+
+    @cached_property
+    def formulas(self) -> tuple[Formula, ...] | None:
+        """The images written out as formulas, None where these are too long to be of use."""
+        if self.effort > MOST_WRITTEN:
+            return None
+        recorder = Recorder()
+        start = tuple(recorder.name(name) for name in self.states)
+
+        def slope(values: Mapping[str, Any]) -> tuple[Any, ...]:
+            return recorder.replay(
+                self.field.formulas, {name: values[name] for name in self.states}
+            )
+
+        return tuple(recorder.formula(image) for image in self._advance({}, start, slope))
 
     def enclose(self, values: Mapping[str, Jet]) -> tuple[Jet, ...]:
         """Enclose the images and their derivatives on boxes."""
