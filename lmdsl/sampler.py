@@ -8,14 +8,13 @@ Plain arithmetic with the control is done line by line instead (lines.py), to th
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import sampling
-from lmdsl.formulas import Formula
 from lmdsl.lines import Lines
 from lmdsl.merging import mean_cost
 from lmdsl.partition import Partition
@@ -86,9 +85,9 @@ class Sampler:
         self.controls = sampling.control_vectors(problem)
         self.nodes = sampling.noise_nodes(problem)
         self.samples = len(self.points) * len(self.nodes.weights)
-        self.step, formulas = _step(problem)
+        self.step = _step(problem)
         self.cost = Program([problem.cost()], problem.system.constants())
-        self._images, self._costs = _split(problem, formulas)
+        self._images, self._costs = _split(problem, self.step, self.cost)
         self._offset = np.ascontiguousarray(self.points.T)[:, :, None]
         self._control = np.ascontiguousarray(self.controls.T)
         self._noise = {
@@ -160,26 +159,21 @@ class Sampler:
         return mean
 
 
-def _step(problem: Problem) -> tuple[Any, Sequence[Formula] | None]:
-    """Return the step and its formulas; None for a user's function, and where they are too long."""
+def _step(problem: Problem) -> Any:
+    """Return the step, as one program where it can be written out: the same, with fewer arrays."""
     step = problem.step()
-    formulas = getattr(step, "formulas", None)
-    if formulas is not None and not isinstance(step, Program):
-        step = Program(formulas, problem.system.constants())  # the same, with fewer arrays
-    return step, formulas
+    formulas = getattr(step, "formulas", None)  # a user's function has none
+    if formulas is None or isinstance(step, Program):
+        return step
+    return Program(formulas, problem.system.constants())
 
 
-def _split(
-    problem: Problem, formulas: Sequence[Formula] | None
-) -> tuple[Lines | None, Lines | None]:
+def _split(problem: Problem, step: Any, cost: Program) -> tuple[Lines | None, Lines | None]:
     """Return how images and costs are made line by line, one and the same for both if possible."""
-    constants, controls = problem.system.constants(), problem.controls
-
-    def lines(*parts: Formula) -> Lines | None:
-        return Lines.of(Program(parts, constants), controls)
-
-    cost = problem.cost()
-    if formulas is None:
-        return None, lines(cost)
-    both = lines(*formulas, cost)
-    return (both, both) if both is not None else (lines(*formulas), lines(cost))
+    images = Lines.of(step, problem.controls) if isinstance(step, Program) else None
+    if images is not None:
+        joint = Program([*step.formulas, *cost.formulas], problem.system.constants())
+        both = Lines.of(joint, problem.controls)
+        if both is not None:
+            return both, both
+    return images, Lines.of(cost, problem.controls)
