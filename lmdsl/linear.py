@@ -31,7 +31,13 @@ TRIAL_SWEEPS = 60
 MAX_SWEEPS = 200_000
 MAX_FACTORED = 100_000
 DENSE = 50
+SOON, LATE = 300, 3_000
+"""Sweeps that are put up with; a large system whose factors may fill is given LATE of them."""
 KRYLOV, KRYLOV_STEPS = 1000, 200
+KRYLOV_FEW, HOPEFUL = 30, 1e-3
+LEAP_SWEEPS, LEAP_STEPS = 4, 16
+LEAST_FALL, FARTHEST = 1e-10, 1e4
+"""A leap is not taken for a smaller relative fall, nor farther: rounding would decide its end."""
 PER_CORE = 20
 """The core may be swept more often than all cells, up to so many times."""
 
@@ -160,6 +166,37 @@ def advance(peeled: Peeled, b: Floats, x: Floats, count: int, enough: float, fla
     return change if peeled.substitute(b, x) else np.inf
 
 
+def leap(system: System, b: Floats, x: Floats) -> float:
+    """Lower x >= b + M x in place, mostly along the mode in which sweeps stall; return how far.
+
+    A few sweeps, then Jacobi steps, which take r = x - (b + M x) from x and turn it into M r: soon
+    along the slowest mode. x - t r >= b + M (x - t r) is t (r - M r) <= r, so the largest t that
+    all components allow is safe; it is 1 / (1 - rate) for a mode alone. Returns t, 1 where nothing
+    was gained over a Jacobi step or x is not above b + M x, up to rounding. (With the diagonal of M
+    solved for, as in sweeps.)
+    """
+    system.sweep(b, x, LEAP_SWEEPS)
+
+    def applied(v: Floats) -> Floats:
+        out = np.empty(len(v))
+        _off_diagonal(system.begin, system.end, system.indices, system.data, v, out)
+        return system.inverse * out
+
+    r = x - system.inverse * b - applied(x)
+    if not ((r >= -LEAST_FALL * x).all() and (r > LEAST_FALL * x).any()):
+        return 1.0
+    np.maximum(r, 0.0, out=r)
+    for _ in range(LEAP_STEPS):
+        x -= r
+        r = applied(r)
+    if not (r > LEAST_FALL * x).any():
+        return 1.0
+    rate = np.divide(applied(r), r, out=np.ones(len(r)), where=r > 0).min()
+    t = min(1.0 / max(1.0 - float(rate), 1e-300), FARTHEST)
+    x -= (t * (1 - 1e-6)) * r
+    return t
+
+
 def _solve(
     system: System,
     b: Floats,
@@ -176,9 +213,10 @@ def _solve(
     change, rate = _trial(system, b, x, enough, flat)
     if change <= enough:
         return x
-    guess = None
-    if len(b) >= KRYLOV and not _soon(change, rate):
-        guess = _krylov(system, b, x, stop)
+    guess, needed = None, _needed(change, rate)
+    many = len(b) >= KRYLOV
+    if many and needed > SOON:
+        guess = _krylov(system, b, x, stop, persist=needed > LATE)
     if guess is not None:
         x = guess
         if nothing is not None:
@@ -186,7 +224,7 @@ def _solve(
         change, rate = _trial(system, b, x, enough, flat)
         if change <= enough:
             return x
-    if not _soon(change, rate):
+    if _needed(change, rate) > (LATE if many else SOON):
         direct, small_enough = solve_by_class(matrix(), b, stop)
         if direct is not None or small_enough:
             return direct
@@ -201,8 +239,10 @@ def _solve(
     return None
 
 
-def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
+def _krylov(system: System, b: Floats, x: Floats, stop: Stop, persist: bool) -> Floats | None:
     """Return a better guess by BiCGSTAB (van der Vorst 1992), None where it breaks down.
+
+    Unless it is to ``persist``, also where a few steps show that no few modes are the hindrance.
 
     It takes one step for each mode that hinders sweeps, such as the slow escape from a well-mixed
     set. A solution >= 0 is the right one: the left Perron vector of a class with spectral radius 1
@@ -215,13 +255,13 @@ def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
         return None
     known /= unit
     with np.errstate(all="ignore"):
-        y = _bicgstab(system, known, x / unit, stop)
-    if not np.isfinite(y).all() or y.min() < -1e-9 * y.max():
+        y = _bicgstab(system, known, x / unit, stop, persist)
+    if y is None or not np.isfinite(y).all() or y.min() < -1e-9 * y.max():
         return None
     return np.maximum(unit * y, b)
 
 
-def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop) -> Floats:
+def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop, persist: bool) -> Floats | None:
     """Solve x - D^-1 (M - own) x = b with D = 1 - own, own the diagonal of M, to 13 digits."""
 
     def applied(v: Floats) -> Floats:
@@ -235,10 +275,13 @@ def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop) -> Floats:
     x = np.where(np.isfinite(x), x, 0.0)
     r = b - applied(x)
     shadow, p, rho = r, r, dot(r, r)
-    enough = 1e-26 * dot(b, b)
-    for _ in range(KRYLOV_STEPS):
-        if not dot(r, r) > enough or rho == 0.0:
+    enough, hopeful = 1e-26 * dot(b, b), HOPEFUL**2 * rho
+    for step in range(KRYLOV_STEPS):
+        left = dot(r, r)
+        if not left > enough or rho == 0.0:
             break
+        if step == KRYLOV_FEW and left > hopeful and not persist:
+            return None
         if stop():
             raise Stopped
         q = applied(p)
@@ -263,10 +306,11 @@ def _pays(system: System, b: Floats) -> NDArray[np.bool_]:
     return pays
 
 
-def _soon(change: float, rate: float) -> bool:
+def _needed(change: float, rate: float) -> float:
+    """Return how many more sweeps are needed at this rate."""
     if not (change < np.inf and rate < 1):
-        return False
-    return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < 300)
+        return np.inf
+    return float(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)))
 
 
 def _trial(system: System, b: Floats, x: Floats, enough: float, flat: float) -> tuple[float, float]:

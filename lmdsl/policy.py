@@ -158,7 +158,8 @@ def iterate(
     -----
     Each step changes every control for which another one is better by a relative 1e-12. Then the
     new policy u is evaluated: to the end where few cells lie on cycles, else by sweeps
-    V <- T_u V, about as long as the improvement took; not at all after the first step, and every
+    V <- T_u V, about as long as the improvement took, or by a leap along the one mode in which they
+    stall (:func:`lmdsl.linear.leap`); not at all after the first step, and every
     second time where few controls changed. V >= T_u V stays true whatever the number of sweeps, so
     V falls and every policy on the way is gamma-stabilizing (docs/mathematics.md, Policy
     iteration); only a policy evaluated to the end is returned as the last.
@@ -168,6 +169,7 @@ def iterate(
     rows: Peeled | None = None  # those of the policy at hand
     V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
     hasty = False  # the policy at hand was not evaluated at all
+    stalls = True  # sweeps do, in a single mode, as far as was seen
     while True:
         out = stop() or step == limit
         done = screen.improve(V, pair, TIE) if not out else Pass(V, pair, 0, 0)
@@ -183,7 +185,12 @@ def iterate(
                 sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
                 rows = Peeled.of(screen.slots.held)  # the pass copied them
                 fall = 0.0 if rows.small else _fall(V, x)
-                left = linear.advance(rows, screen.paid, x, sweeps, 0.1 * fall, 0.0)
+                leapt = stalls and not rows.small
+                if leapt:
+                    stalls = leapt = linear.leap(rows.system, screen.paid, x) > 2
+                left = np.inf
+                if not leapt:
+                    left = linear.advance(rows, screen.paid, x, sweeps, 0.1 * fall, 0.0)
                 paid = bool((screen.paid > 0).all())  # else what is free has to become 0
                 exact = x if left <= TOLERANCE and paid else None
                 x = np.minimum(x, done.value)

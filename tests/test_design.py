@@ -41,6 +41,7 @@ transitions
 graph
 lp
 bellman rational
+locality
 screening
 bounds
 policy growth
