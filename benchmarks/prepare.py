@@ -31,7 +31,7 @@ def _write(name: str, gamma: float, path: Path) -> dict[str, Any]:
     started = time.perf_counter()
     lp = models.get(name).compiled(gamma)
     seconds = time.perf_counter() - started
-    result = lm.solve(lp)
+    result = lm.solve(lp, tolerance=GAP)
     proof = result.certificate
     if not (proof.upper_bound and proof.lower_bound and proof.gap is not None and proof.gap <= GAP):
         raise RuntimeError(f"no certified value to compare with: {result.status}, {result.message}")

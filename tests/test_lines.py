@@ -168,3 +168,25 @@ def test_long_steps_are_not_written_out():
     step = lm.Problem.model_validate(data).step()
     assert step.formulas is None
     assert sampled(lm.Problem.model_validate(data))[0]._images is None
+
+
+def test_formulas_that_repeat_themselves_are_not_written_out():
+    """Few operations, as equal ones are done once, but as many nodes as a file may have."""
+    data = dict(lm.systems.NAMED["double_integrator"].problem)
+    long = "x*v + u"
+    for _ in range(6):
+        long = f"({long})*({long})"
+    data["system"] = {
+        "kind": "ode",
+        "derivative": {"x": long, "v": long},
+        "step": 0.1,
+        "substeps": 5,
+    }
+    data["state_box"] = {
+        name: data["state_box"][k] for name, k in zip("xv", data["state_box"], strict=True)
+    }
+    data["attractor"] = {"points": [{"x": 0, "v": 0}]}
+    data["stage_cost"] = "1"
+    step = lm.Problem.model_validate(data).step()
+    assert step.effort < 1_000
+    assert step.formulas is None

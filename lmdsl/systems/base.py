@@ -127,7 +127,7 @@ class OdeSystem(System):
 
 
 MOST_WRITTEN = 1_000
-"""Operations up to which a step is written out."""
+"""Operations, and nodes of the formulas times substeps, up to which a step is written out."""
 
 
 class _RungeKutta:
@@ -147,7 +147,8 @@ class _RungeKutta:
     @cached_property
     def formulas(self) -> tuple[Formula, ...] | None:
         """The images written out as formulas, None where these are too long to be of use."""
-        if self.effort > MOST_WRITTEN:
+        nodes = sum(len(formula.steps) for formula in self.field.formulas)
+        if max(self.effort, self.substeps * nodes) > MOST_WRITTEN:
             return None
         recorder = Recorder()
         start = tuple(recorder.name(name) for name in self.states)
