@@ -31,13 +31,11 @@ TRIAL_SWEEPS = 60
 MAX_SWEEPS = 200_000
 MAX_FACTORED = 100_000
 DENSE = 50
-SOON, LATE = 300, 3_000
-"""Sweeps that are put up with; a large system whose factors may fill is given LATE of them."""
 KRYLOV, KRYLOV_STEPS = 1000, 200
-KRYLOV_FEW, HOPEFUL = 30, 1e-3
 LEAP_SWEEPS, LEAP_STEPS = 4, 16
 LEAST_FALL, FARTHEST = 1e-10, 1e4
 """A leap is not taken for a smaller relative fall, nor farther: rounding would decide its end."""
+ROUNDING = 1e-13
 PER_CORE = 20
 """The core may be swept more often than all cells, up to so many times."""
 
@@ -183,7 +181,7 @@ def leap(system: System, b: Floats, x: Floats) -> float:
         return system.inverse * out
 
     r = x - system.inverse * b - applied(x)
-    if not ((r >= -LEAST_FALL * x).all() and (r > LEAST_FALL * x).any()):
+    if not ((r >= -ROUNDING * x).all() and (r > LEAST_FALL * x).any()):
         return 1.0
     np.maximum(r, 0.0, out=r)
     for _ in range(LEAP_STEPS):
@@ -213,10 +211,9 @@ def _solve(
     change, rate = _trial(system, b, x, enough, flat)
     if change <= enough:
         return x
-    guess, needed = None, _needed(change, rate)
-    many = len(b) >= KRYLOV
-    if many and needed > SOON:
-        guess = _krylov(system, b, x, stop, persist=needed > LATE)
+    guess = None
+    if len(b) >= KRYLOV and not _soon(change, rate):
+        guess = _krylov(system, b, x, stop)
     if guess is not None:
         x = guess
         if nothing is not None:
@@ -224,7 +221,7 @@ def _solve(
         change, rate = _trial(system, b, x, enough, flat)
         if change <= enough:
             return x
-    if _needed(change, rate) > (LATE if many else SOON):
+    if not _soon(change, rate):
         direct, small_enough = solve_by_class(matrix(), b, stop)
         if direct is not None or small_enough:
             return direct
@@ -239,10 +236,8 @@ def _solve(
     return None
 
 
-def _krylov(system: System, b: Floats, x: Floats, stop: Stop, persist: bool) -> Floats | None:
+def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
     """Return a better guess by BiCGSTAB (van der Vorst 1992), None where it breaks down.
-
-    Unless it is to ``persist``, also where a few steps show that no few modes are the hindrance.
 
     It takes one step for each mode that hinders sweeps, such as the slow escape from a well-mixed
     set. A solution >= 0 is the right one: the left Perron vector of a class with spectral radius 1
@@ -255,13 +250,13 @@ def _krylov(system: System, b: Floats, x: Floats, stop: Stop, persist: bool) -> 
         return None
     known /= unit
     with np.errstate(all="ignore"):
-        y = _bicgstab(system, known, x / unit, stop, persist)
-    if y is None or not np.isfinite(y).all() or y.min() < -1e-9 * y.max():
+        y = _bicgstab(system, known, x / unit, stop)
+    if not np.isfinite(y).all() or y.min() < -1e-9 * y.max():
         return None
     return np.maximum(unit * y, b)
 
 
-def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop, persist: bool) -> Floats | None:
+def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop) -> Floats:
     """Solve x - D^-1 (M - own) x = b with D = 1 - own, own the diagonal of M, to 13 digits."""
 
     def applied(v: Floats) -> Floats:
@@ -275,13 +270,10 @@ def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop, persist: bool) -
     x = np.where(np.isfinite(x), x, 0.0)
     r = b - applied(x)
     shadow, p, rho = r, r, dot(r, r)
-    enough, hopeful = 1e-26 * dot(b, b), HOPEFUL**2 * rho
-    for step in range(KRYLOV_STEPS):
-        left = dot(r, r)
-        if not left > enough or rho == 0.0:
+    enough = 1e-26 * dot(b, b)
+    for _ in range(KRYLOV_STEPS):
+        if not dot(r, r) > enough or rho == 0.0:
             break
-        if step == KRYLOV_FEW and left > hopeful and not persist:
-            return None
         if stop():
             raise Stopped
         q = applied(p)
@@ -306,11 +298,10 @@ def _pays(system: System, b: Floats) -> NDArray[np.bool_]:
     return pays
 
 
-def _needed(change: float, rate: float) -> float:
-    """Return how many more sweeps are needed at this rate."""
+def _soon(change: float, rate: float) -> bool:
     if not (change < np.inf and rate < 1):
-        return np.inf
-    return float(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)))
+        return False
+    return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < 300)
 
 
 def _trial(system: System, b: Floats, x: Floats, enough: float, flat: float) -> tuple[float, float]:

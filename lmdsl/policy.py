@@ -185,11 +185,11 @@ def iterate(
                 sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
                 rows = Peeled.of(screen.slots.held)  # the pass copied them
                 fall = 0.0 if rows.small else _fall(V, x)
-                leapt = stalls and not rows.small
-                if leapt:
-                    stalls = leapt = linear.leap(rows.system, screen.paid, x) > 2
-                left = np.inf
-                if not leapt:
+                far, left = 0.0, np.inf
+                if stalls and not rows.small:
+                    far = linear.leap(rows.system, screen.paid, x)
+                    stalls = 2 * far > sweeps
+                if far < sweeps:
                     left = linear.advance(rows, screen.paid, x, sweeps, 0.1 * fall, 0.0)
                 paid = bool((screen.paid > 0).all())  # else what is free has to become 0
                 exact = x if left <= TOLERANCE and paid else None

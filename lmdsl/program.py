@@ -69,7 +69,7 @@ class Program:
                 placed.append(slot)
             self.outputs.append(placed[-1])
         self.variables = {str(k[1]): s for k, s in self._slots.items() if k[0] == "name"}
-        self.instructions = self._with_lifetimes(instructions)
+        self.instructions = self._with_lifetimes(_needed(instructions, self.outputs))
         self.names = frozenset(self.variables)
         self.operations = tuple(step.operation for step in instructions)
         self.effort = max(len(instructions), 1)
@@ -103,15 +103,12 @@ class Program:
 
     def part(self, outputs: Sequence[int]) -> Program:
         """Return the program that computes some of the slots, and nothing that they do not need."""
-        needed, kept = set(outputs), []
-        for step in reversed(self.instructions):
-            if step.target in needed:
-                needed.update(step.operands)
-                kept.append(step)
         part = copy.copy(self)
         part.outputs = list(outputs)
-        part.variables = {name: k for name, k in self.variables.items() if k in needed}
-        part.instructions = part._with_lifetimes(kept[::-1])
+        steps = _needed(self.instructions, outputs)
+        read = {*outputs, *(k for step in steps for k in step.operands)}
+        part.variables = {name: k for name, k in self.variables.items() if k in read}
+        part.instructions = part._with_lifetimes(steps)
         part.names, part.formulas = frozenset(part.variables), ()
         part.operations = tuple(step.operation for step in part.instructions)
         part.effort = max(len(part.instructions), 1)
@@ -172,6 +169,16 @@ class Program:
             for step in self.instructions:
                 slots[step.target] = apply(step.operation, [slots[k] for k in step.operands])
         return tuple(slots[slot] for slot in self.outputs)
+
+
+def _needed(instructions: Sequence[Instruction], outputs: Sequence[int]) -> list[Instruction]:
+    """Return the instructions whose results are needed: nothing would ever release the others."""
+    needed, kept = set(outputs), []
+    for step in reversed(instructions):
+        if step.target in needed:
+            needed.update(step.operands)
+            kept.append(step)
+    return kept[::-1]
 
 
 def _room(operands: list[Any], reusable: list[Any]) -> dict[str, Any]:

@@ -24,6 +24,9 @@ from lmdsl.program import Program
 CHUNK = 2**17
 """Samples evaluated at a time: few enough to stay in cache, many enough to keep threads apart."""
 
+LEAST_LINE = 64
+"""Pairs side by side below which arithmetic line by line does not pay: its lines are as short."""
+
 Floats = NDArray[np.float64]
 
 
@@ -129,11 +132,13 @@ class Sampler:
         shape = (first, len(self.points), len(self.nodes.weights), last)
         index = mean = None
         axes, clip, weights = self.partition.axes, self.partition.clip, self.nodes.weights
-        if self._images is not None:
-            paid = weights if self._costs is self._images else None
-            index, mean = self._images(values, shape, axes, clip, paid)
-        elif self._costs is not None:
-            _, mean = self._costs(values, shape, (), clip, weights)
+        if last >= LEAST_LINE:
+            images, costs = self._images, self._costs
+            if images is not None:
+                paid = weights if costs is images else None
+                index, mean = images(values, shape, axes, clip, paid)
+            if costs is not None and costs is not images:
+                _, mean = costs(values, shape, (), clip, weights)
         index = self.images(block, values) if index is None else index
         return index, self.costs(block, values) if mean is None else mean
 

@@ -4,9 +4,7 @@ Along a falling sequence of values V the Q of a pair falls too, but no faster th
 V' >= r V then gamma P_a V' + G_a >= r (gamma P_a V + G_a) for 0 < r <= 1, because G_a >= 0. So the
 least Q among the rivals of a cell's control, divided by the product of all ratios before it was
 found, times that of all so far, bounds them from below for ever. A cell whose value is below that
-bound needs no look at its rows. Late passes read a few numbers a cell, no rows. The ratio r need
-hold only for the successors of the cell: where systems move little in a step, those in a few tiles
-of cells near it (locality.py).
+bound needs no look at its rows. Late passes read a few numbers a cell, no rows.
 
 A bound for every pair would leave out more rows, but takes longer than it saves: a processor reads
 all rows of a cell in less time than it takes to find out which of them to read.
@@ -22,7 +20,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bellman
-from lmdsl.locality import Neighbourhoods
 from lmdsl.lp import StabilizationLP
 from lmdsl.rows import Slots, copy_row
 from lmdsl.sweeps import ONE
@@ -31,9 +28,6 @@ Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 LEAST_SCALE = 1e-30
-FEW, MUCH = 100, 0.75
-"""Changes in fewer than one of so many cells, found by reading so large a share of all rows: then
-bounds fall with what V lost near each cell, no longer with what it lost anywhere."""
 MOST = 1e308
 
 
@@ -87,7 +81,6 @@ class Screen:
         self.scale = 1.0
         self.passes = 0
         self.pair: Pairs | None = None  # whose rivals
-        self.local = False  # whether it pays to see where V falls
 
     @cached_property
     def slots(self) -> Slots:
@@ -123,9 +116,7 @@ class Screen:
 
         counts = bellman.over_cells(lp, part, bellman.IN_PLACE)
         self.pair = new
-        done = Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
-        self.local |= done.changed * FEW < lp.n and done.looked > MUCH * lp.K
-        return done
+        return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
 
     def tied(
         self, V: Floats, tolerance: float, pair: Pairs
@@ -161,16 +152,8 @@ class Screen:
 
         return ties, first, any(bellman.over_cells(lp, part))
 
-    @cached_property
-    def _near(self) -> Neighbourhoods | None:
-        return Neighbourhoods.of(self.lp)
-
     def follow(self, before: Floats, after: Floats) -> None:
         """Note that V fell from ``before`` to ``after``."""
-        if self.local and self._near is not None:
-            self.rival *= self._near.least_ratio(before, after) * (self.scale * (1 - 1e-13))
-            self.scale = 1.0
-            return
         self.scale *= float(_least_ratio(before, after)) * (1 - 1e-13)
         if self.scale < LEAST_SCALE:
             self.rival *= self.scale

@@ -41,7 +41,6 @@ transitions
 graph
 lp
 bellman rational
-locality
 screening
 bounds
 policy growth

@@ -46,6 +46,7 @@ def test_random_problems(monkeypatch):
     """Maps and differential equations, noise, clipping, one to three axes, one or two controls."""
     rng, seen = np.random.default_rng(20), set()
     monkeypatch.setattr(lines, "LEAST", 1)
+    monkeypatch.setattr(sampler, "LEAST_LINE", 1)
     for turn in range(80):
         monkeypatch.setattr(lines, "LINE", (512, 7)[turn % 2])
         monkeypatch.setattr(sampler, "CHUNK", (2**17, 300)[turn // 2 % 2])  # both orientations
@@ -96,6 +97,31 @@ def test_what_is_not_correctly_rounded_is_left_to_numpy(text, monkeypatch):
     monkeypatch.setattr(lines, "LEAST", 1)
     assert Lines.of(Program([parse(text, {"x", "u"})]), ["u"]) is None
     assert compared(with_step(text)) == (False, True)
+
+
+def test_short_lines_are_left_to_numpy(monkeypatch):
+    problem = lm.Problem.model_validate(dict(lm.systems.NAMED["lorenz"].problem))
+    drawn, free = sampled(problem)
+    assert drawn._images is not None
+    monkeypatch.setattr(lines, "_run", None)  # what is not called may be missing
+    block = next(drawn.blocks(free[:20]))
+    assert block.shape[1] < sampler.LEAST_LINE
+    drawn.outcomes(block)
+    with pytest.raises(TypeError):
+        drawn.outcomes(next(drawn.blocks(free[:200])))
+
+
+def test_what_no_result_needs_is_not_computed():
+    """Written out, Runge-Kutta steps states that no right-hand side reads: never freed."""
+    data = dict(lm.systems.NAMED["double_integrator"].problem)
+    data["system"] = {"kind": "ode", "derivative": {"x": "v", "v": "sin(v*u)"}, "step": 0.1}
+    data["state_box"] = dict(zip("xv", data["state_box"].values(), strict=True))
+    data["attractor"], data["stage_cost"] = {"points": [{"x": 0, "v": 0}]}, "1"
+    problem = lm.Problem.model_validate(data)
+    program = sampled(problem)[0].step
+    read = {k for step in program.instructions for k in step.operands} | set(program.outputs)
+    assert all(step.target in read for step in program.instructions)
+    assert len(program.instructions) < len(program.operations)
 
 
 def test_few_operations_are_left_to_numpy():

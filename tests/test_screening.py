@@ -10,7 +10,7 @@ from models import random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import bellman, feasibility, locality, policy
+from lmdsl import bellman, feasibility, policy
 from lmdsl.screening import Screen
 
 MARGIN = 1e-12
@@ -67,10 +67,7 @@ def begun(lp):
 
 
 @pytest.mark.parametrize("ranges", [1, 3])
-@pytest.mark.parametrize("local", [False, True])
-def test_passes_agree_with_numpy_and_bounds_hold(monkeypatch, ranges, local):
-    """With one ratio for all cells, and with that of the tiles near each (locality.py)."""
-    monkeypatch.setattr(locality, "FEW", 0 if local else 10**9)
+def test_passes_agree_with_numpy_and_bounds_hold(monkeypatch, ranges):
     monkeypatch.setattr(bellman, "IN_PLACE", ranges)
     monkeypatch.setattr(bellman, "GRAIN", 1)
     left_out = 0
@@ -81,7 +78,6 @@ def test_passes_agree_with_numpy_and_bounds_hold(monkeypatch, ranges, local):
         count = min(ranges, lp.n, len(lp.rows.target))
         parts = [(lp.n * k // count, lp.n * (k + 1) // count) for k in range(count)]
         screen = Screen(lp)
-        screen.local = local
         for step in range(8):
             settled = screen.rival * screen.scale
             x, new = reference(lp, V, pair, step % 2 == 1, parts, settled)
@@ -128,46 +124,3 @@ def test_bounds_hold_for_a_policy_the_last_pass_did_not_choose():
         screen.follow(V, done.value)
         assert (screen.rival * screen.scale <= rivals(lp, done.pair, done.value)).all()
     assert changed
-
-
-def near(lp):
-    """The tiles that each cell leads to, from the rows as a matrix."""
-    P, tile = lp.rows.matrix(), locality._tiles(lp)
-    for i in range(lp.n):
-        yield tile, set(tile[P[lp.pair_pointer[i] : lp.pair_pointer[i + 1]].indices].tolist())
-
-
-@pytest.mark.parametrize(("tiles", "room"), [(1, 24), (30, 24), (1000, 24), (1000, 14)])
-def test_neighbourhoods_are_the_tiles_of_the_successors(monkeypatch, tiles, room):
-    monkeypatch.setattr(locality, "TILES", tiles)
-    monkeypatch.setattr(locality, "ROOM", room)
-    monkeypatch.setattr(locality, "FEW", 0)
-    rng, many = np.random.default_rng(0), 0
-    for lp in (lm.compile(made(standard_map(12))), lm.compile(made(standard_map(30)))):
-        found = locality.Neighbourhoods.of(lp)
-        if found is None:
-            assert np.median([len(s) for _, s in near(lp)]) > locality.ROOM
-            continue
-        before = rng.uniform(1, 2, lp.n)
-        after = before * rng.uniform(0.5, 1.0, lp.n)
-        before[0] = after[0] = 0.0
-        ratio = np.divide(after, before, out=np.ones(lp.n), where=before > 0)
-        least = found.least_ratio(before, after)
-        for i, (tile, expected) in enumerate(near(lp)):
-            if len(expected) > locality.ROOM:
-                many += 1
-                assert found.count[i] == locality.ROOM + 1
-                assert least[i] == ratio.min()
-                continue
-            assert set(found.near[i, : found.count[i]].tolist()) == expected
-            in_reach = np.isin(tile, list(expected))
-            assert least[i] == ratio[in_reach].min(initial=1.0)
-    assert bool(many) == (room == 14)
-
-
-def test_models_that_lead_everywhere_or_are_small_have_no_neighbourhoods(monkeypatch):
-    lp = random_lp(np.random.default_rng(0), cells=400, controls=30, samples=3)
-    assert locality.Neighbourhoods.of(lp) is None
-    monkeypatch.setattr(locality, "FEW", 0)
-    monkeypatch.setattr(locality, "ROOM", 1)
-    assert locality.Neighbourhoods.of(lm.compile(made(standard_map(30)))) is None
