@@ -1,11 +1,52 @@
-"""``python -m lmdsl``."""
+"""``python -m lmdsl``, and the command ``lmdsl``."""
 
+from __future__ import annotations
+
+import _thread
+import os
+import signal
 import sys
+import time
+from types import FrameType
 
-try:
-    from lmdsl.cli import main
+PATIENCE = 5.0
+"""Seconds that an interrupted command has to end by itself."""
 
-    sys.exit(main())
-except KeyboardInterrupt:  # before main() could take care of it
-    print("lmdsl: interrupted", file=sys.stderr)
-    sys.exit(130)
+_ended = False
+
+
+def run() -> int:
+    """Run the command line and return its exit status; Ctrl-C ends it whatever happens.
+
+    KeyboardInterrupt may come between the taking of a lock and the block that would release it
+    (inside the standard library's thread pool, say), and a thread then waits for ever. Results
+    are written whole or not at all, so the process can be ended at any moment.
+    """
+    global _ended
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
+    try:
+        from lmdsl.cli import main
+
+        return main()
+    except KeyboardInterrupt:  # before main() could take care of it
+        print("lmdsl: interrupted", file=sys.stderr)
+        return 130
+    finally:
+        _ended = True
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    _thread.start_new_thread(_end, ())  # not one of threading's: these take locks
+    signal.default_int_handler(number, frame)
+
+
+def _end() -> None:
+    time.sleep(PATIENCE)
+    if not _ended:  # else it was said
+        os.write(2, (b"\r\x1b[K" if os.isatty(2) else b"") + b"lmdsl: interrupted\n")
+    os._exit(130)
+
+
+if __name__ == "__main__":
+    sys.exit(run())

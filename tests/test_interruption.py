@@ -267,6 +267,43 @@ def test_ctrl_c_on_a_terminal(tmp_path, stage):
     assert [path.name for path in tmp_path.iterdir()] == ["problem.json"]
 
 
+STUCK = """
+import sys, threading, time
+import lmdsl.cli
+from lmdsl import __main__ as command
+
+def main():
+    lock = threading.Lock()
+    lock.acquire()
+    print("ready", flush=True)
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        if sys.argv[1] == "after":
+            print("lmdsl: interrupted", file=sys.stderr)
+            threading.Thread(target=lock.acquire).start()  # Python waits for it at its end
+            return 130
+        lock.acquire()
+
+lmdsl.cli.main = main
+command.PATIENCE = 0.3
+sys.exit(command.run())
+"""
+
+
+@posix
+@pytest.mark.parametrize("when", ["during", "after"])
+def test_ctrl_c_ends_a_command_that_waits_for_a_lock_for_ever(when):
+    process = subprocess.Popen(
+        [sys.executable, "-c", STUCK, when], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout.readline() == b"ready\n"
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err == b"lmdsl: interrupted\n"
+
+
 # The same bytes -----------------------------------------------------------------------------
 
 NOISY = {
