@@ -61,8 +61,8 @@ OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
     "+": np.add, "-": np.subtract, "*": np.multiply, "/": np.true_divide, "**": _power,
     "negative": np.negative, "where": np.where, **_UFUNCS, **_COMPARISONS,
 }  # fmt: skip
-# Correctly rounded: the same bits whichever loop NumPy picks, so they may run in place.
-IN_PLACE: Final = frozenset({"+", "-", "*", "/", "negative", "abs", "sqrt", "floor", "ceil"})
+# Correctly rounded: the same bits whichever loop computes them, in place or not.
+PLAIN: Final = ("+", "-", "*", "/", "negative", "abs", "sqrt", "floor", "ceil")
 
 FORMULA_CONSTANTS: Final[Mapping[str, float]] = MappingProxyType({"pi": math.pi, "e": math.e})
 FORMULA_FUNCTIONS: Final[Mapping[str, int]] = MappingProxyType(

@@ -174,22 +174,16 @@ def leap(system: System, b: Floats, x: Floats) -> float:
     solved for, as in sweeps.)
     """
     system.sweep(b, x, LEAP_SWEEPS)
-
-    def applied(v: Floats) -> Floats:
-        out = np.empty(len(v))
-        _off_diagonal(system.begin, system.end, system.indices, system.data, v, out)
-        return system.inverse * out
-
-    r = x - system.inverse * b - applied(x)
+    r = x - system.inverse * b - _moved(system, x)
     if not ((r >= -ROUNDING * x).all() and (r > LEAST_FALL * x).any()):
         return 1.0
     np.maximum(r, 0.0, out=r)
     for _ in range(LEAP_STEPS):
         x -= r
-        r = applied(r)
+        r = _moved(system, r)
     if not (r > LEAST_FALL * x).any():
         return 1.0
-    rate = np.divide(applied(r), r, out=np.ones(len(r)), where=r > 0).min()
+    rate = np.divide(_moved(system, r), r, out=np.ones(len(r)), where=r > 0).min()
     t = min(1.0 / max(1.0 - float(rate), 1e-300), FARTHEST)
     x -= (t * (1 - 1e-6)) * r
     return t
@@ -260,9 +254,7 @@ def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop) -> Floats:
     """Solve x - D^-1 (M - own) x = b with D = 1 - own, own the diagonal of M, to 13 digits."""
 
     def applied(v: Floats) -> Floats:
-        out = np.empty(len(v))
-        _off_diagonal(system.begin, system.end, system.indices, system.data, v, out)
-        return v - system.inverse * out
+        return v - _moved(system, v)
 
     def dot(u: Floats, v: Floats) -> Any:
         return (u * v).sum()
@@ -289,6 +281,13 @@ def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop) -> Floats:
         before, rho = rho, dot(shadow, r)
         p = r + (rho / before) * (alpha / omega) * (p - omega * q)
     return x
+
+
+def _moved(system: System, v: Floats) -> Floats:
+    """Return D^-1 (M - own) v with D = 1 - own, own the diagonal of M: one Jacobi step."""
+    out = np.empty(len(v))
+    _off_diagonal(system.begin, system.end, system.indices, system.data, v, out)
+    return system.inverse * out
 
 
 def _pays(system: System, b: Floats) -> NDArray[np.bool_]:

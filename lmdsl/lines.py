@@ -17,6 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lmdsl.formulas import PLAIN
+from lmdsl.merging import add_cost, settle_cost
 from lmdsl.partition import Axis, circle, interval
 from lmdsl.program import Instruction, Program
 
@@ -29,9 +31,7 @@ LINE = 512
 LEAST, MOST = 8, 1_000
 """Instructions worth it: with fewer NumPy is as fast, with many more lines leave the cache."""
 
-PLAIN = ("+", "-", "*", "/", "negative", "abs", "sqrt", "floor", "ceil")
-"""Correctly rounded operations, by code."""
-
+# The codes of operations: their places among the plain ones.
 ADD, SUBTRACT, MULTIPLY, DIVIDE, NEGATIVE, ABS, SQRT, FLOOR, CEIL = range(len(PLAIN))
 
 
@@ -258,12 +258,10 @@ def _run(  # type: ignore[no-untyped-def]
                     for a in range(len(located)):
                         _locate(work[located[a]][:n], axes[a], clip, line)
                 if len(mean):
-                    _pay(work[paid], weights[q], mean[i, j : j + n], least[i, j : j + n])
+                    add_cost(work[paid], weights[q], mean[i, j : j + n], least[i, j : j + n])
     total = points * weights.sum()
     for i in range(len(mean)):
-        for j in range(last):
-            g = mean[i, j] / total  # not finite as soon as one sample is not
-            mean[i, j] = g if (least[i, j] >= 0.0) & (g < np.inf) else np.nan
+        settle_cost(mean[i], least[i], total)
 
 
 @njit(cache=True, nogil=True)
@@ -283,14 +281,6 @@ def _locate(image, axis, clip, index):  # type: ignore[no-untyped-def]
         circle(image, low, width, cells, stride, index)
     else:
         interval(image, low, high, width, cells, stride, clip, index)
-
-
-@njit(cache=True, nogil=True)
-def _pay(cost, weight, mean, least):  # type: ignore[no-untyped-def]
-    """Add the cost of one sample to its pairs, and note the least."""
-    for j in range(len(mean)):
-        least[j] = cost[j] if cost[j] < least[j] else least[j]
-        mean[j] += weight * cost[j]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -152,6 +152,22 @@ def _row(key, k, bits, first_code, entries, target, code):  # type: ignore[no-un
     return entries + ONE
 
 
+@njit(cache=True, nogil=True)
+def add_cost(cost, weight, mean, least):  # type: ignore[no-untyped-def]
+    """Add the cost of one sample to its pairs, and note the least."""
+    for j in range(len(mean)):
+        least[j] = cost[j] if cost[j] < least[j] else least[j]
+        mean[j] += weight * cost[j]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def settle_cost(mean, least, total):  # type: ignore[no-untyped-def]
+    """Turn sums into means, NaN where a sample was negative or not finite."""
+    for j in range(len(mean)):
+        g = mean[j] / total  # not finite as soon as one sample is not
+        mean[j] = g if (least[j] >= 0.0) & (g < np.inf) else np.nan
+
+
 @njit(
     types.void(
         types.Array(types.float64, 4, "C", readonly=True),
@@ -185,9 +201,5 @@ def mean_cost(cost, points, weights, mean):  # type: ignore[no-untyped-def]
         for p in range(points):
             for q in range(len(weights)):
                 row = cost[i, min(p, cost.shape[1] - 1), min(q, cost.shape[2] - 1)]
-                for j in range(len(line)):
-                    least[j] = row[j] if row[j] < least[j] else least[j]
-                    line[j] += weights[q] * row[j]
-        for j in range(len(line)):
-            g = line[j] / total  # not finite as soon as one sample is not
-            line[j] = g if (least[j] >= 0.0) & (g < np.inf) else np.nan
+                add_cost(row, weights[q], line, least)
+        settle_cost(line, least, total)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.errors import BadInput
-from lmdsl.formulas import IN_PLACE, OPERATIONS, Formula, Step, fold
+from lmdsl.formulas import OPERATIONS, PLAIN, Formula, Step, fold
 from lmdsl.jets import Jet, apply
 
 
@@ -96,7 +96,7 @@ class Program:
         for step in reversed(instructions):
             released = tuple(dict.fromkeys(k for k in step.operands if k not in live))
             live.update(step.operands)
-            in_place = step.operation in IN_PLACE
+            in_place = step.operation in PLAIN
             reusable = tuple(k for k in released if in_place and k not in inputs)
             marked.append(step._replace(released=released, reusable=reusable))
         return marked[::-1]
