@@ -42,7 +42,7 @@ def improvement_sweep(lp: lm.StabilizationLP, V: NDArray[Any]) -> Callable[[], A
 
 def evaluation_sweep(lp: lm.StabilizationLP, pair: NDArray[Any]) -> Callable[[], Any]:
     """Return one evaluation sweep over the rows of a policy."""
-    system, b = lp.rows.system(pair, lp.gamma), lp.cost[pair]
+    system, b = lp.rows.system(pair, lp.gamma, lp.directions), lp.cost[pair]
     x = b.copy()
     return lambda: system.sweep(b, x, 1)
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import graph
+from lmdsl.directions import Directions
 from lmdsl.errors import BadInput
 from lmdsl.files import write_whole
 from lmdsl.graph import CellStatus, Predecessors
@@ -185,6 +186,11 @@ class StabilizationLP:
     def kernel(self) -> tuple[NDArray[Any], ...]:
         """The pairs of every cell and their rows as compiled loops read them."""
         return self.pair_pointer.view(np.uint64), *self.rows.kernel
+
+    @cached_property
+    def directions(self) -> Directions:
+        """Orders in which sweeps visit the cells."""
+        return Directions(self.cells, self.partition.shape)
 
     @cached_property
     def predecessors(self) -> Predecessors:

@@ -77,7 +77,10 @@ class Peeled:
         entries = int(length.sum())
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
         _take(core, system.begin, system.end, system.indices, system.data, number, indices, data)
-        inner = System(begin, begin + length, indices, data, system.inverse[core])
+        inner = System(
+            begin, begin + length, indices, data, system.inverse[core],
+            system.directions.among(core),
+        )  # fmt: skip
         return cls(system, order[:count], ends, core, inner)
 
     @property

@@ -77,7 +77,7 @@ def evaluate(
 
 def peeled(lp: StabilizationLP, pair: Pairs, gamma: float) -> Peeled:
     """Return gamma P_u, ready for :func:`evaluate`."""
-    return Peeled.of(lp.rows.system(pair, gamma))
+    return Peeled.of(lp.rows.system(pair, gamma, lp.directions))
 
 
 def reaches_attractor(lp: StabilizationLP, pair: Pairs) -> Bools:

@@ -21,6 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import threads
+from lmdsl.directions import Directions
 from lmdsl.sampling import Nodes
 from lmdsl.sweeps import NEVER, ONE, System
 
@@ -141,9 +142,10 @@ class Rows:
         threads.each(copy, spans)
         return Rows(pointer, target, code, self.shares, self.columns)
 
-    def system(self, rows: NDArray[np.int64], gamma: float) -> System:
+    def system(self, rows: NDArray[np.int64], gamma: float, directions: Directions) -> System:
         """Return gamma P for one row per column, ready for sweeps."""
-        return Slots(self, self.pointer[rows + 1] - self.pointer[rows], gamma).system(rows)
+        room = self.pointer[rows + 1] - self.pointer[rows]
+        return Slots(self, room, gamma, directions).system(rows)
 
     def matrix(self, rows: NDArray[np.integer] | None = None):  # type: ignore[no-untyped-def]
         """Return rows as a SciPy CSR array of doubles, shape (len(rows), columns).
@@ -180,9 +182,13 @@ class Slots:
         Largest number of entries that the row of each cell may have, shape (n,).
     gamma
         Weight of the rows.
+    directions
+        Orders in which sweeps visit the cells.
     """
 
-    def __init__(self, rows: Rows, room: NDArray[np.int64], gamma: float) -> None:
+    def __init__(
+        self, rows: Rows, room: NDArray[np.int64], gamma: float, directions: Directions
+    ) -> None:
         self.rows, self.gamma = rows, gamma
         ends = np.cumsum(room)
         count, entries = len(room), int(ends[-1]) if len(room) else 0
@@ -193,10 +199,13 @@ class Slots:
             np.empty(entries, dtype=np.uint32),
             np.empty(entries),
             np.empty(count),
+            directions,
         )
 
     @classmethod
-    def of(cls, rows: Rows, pair_pointer: NDArray[np.int64], gamma: float) -> Slots:
+    def of(
+        cls, rows: Rows, pair_pointer: NDArray[np.int64], gamma: float, directions: Directions
+    ) -> Slots:
         """Make room for any policy, a pair of each cell's own."""
         room = np.empty(len(pair_pointer) - 1, dtype=np.int64)
 
@@ -204,7 +213,7 @@ class Slots:
             _longest(*span, pair_pointer.view(np.uint64), rows.kernel[0], room)
 
         threads.each(longest, _spans(len(room)))
-        return cls(rows, room, gamma)
+        return cls(rows, room, gamma, directions)
 
     def system(self, chosen: NDArray[np.int64]) -> System:
         """Return gamma P for one row of each cell; it holds until the next call."""

@@ -85,7 +85,8 @@ class Screen:
     @cached_property
     def slots(self) -> Slots:
         """Room for the rows of the policy."""
-        return Slots.of(self.lp.rows, self.lp.pair_pointer, self.gamma)
+        lp = self.lp
+        return Slots.of(lp.rows, lp.pair_pointer, self.gamma, lp.directions)
 
     def improve(self, V: Floats, pair: Pairs, margin: float) -> Pass:
         """Change a control where another one is better by more than a relative margin.

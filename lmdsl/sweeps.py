@@ -13,6 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import threads
+from lmdsl.directions import Directions
 
 Floats = NDArray[np.float64]
 
@@ -33,6 +34,8 @@ class System:
         The rows of M without its diagonal: row i is ``begin[i]:end[i]``.
     inverse
         1 / (1 - M_ii), huge where M_ii >= 1: no finite x_i > 0 satisfies such a row.
+    directions
+        Orders in which sweeps visit the components.
     """
 
     begin: NDArray[np.uint64]
@@ -40,6 +43,7 @@ class System:
     indices: NDArray[np.uint32]
     data: Floats
     inverse: Floats
+    directions: Directions
 
     @classmethod
     def of(cls, M: Any) -> System:
@@ -50,7 +54,7 @@ class System:
         inverse = np.empty(n)
         begin = M.indptr[:-1].astype(np.uint64)
         _split(M.indptr, M.indices, M.data, end, indices, data, inverse)
-        return cls(begin, end, indices, data, inverse)
+        return cls(begin, end, indices, data, inverse, Directions.line(n))
 
     def transposed(self) -> System:
         """Return the transposed matrix."""
@@ -61,7 +65,7 @@ class System:
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
         end = start[:-1].copy()
         _turn(self.begin, self.end, self.indices, self.data, end, indices, data)
-        return System(start[:-1], end, indices, data, self.inverse)
+        return System(start[:-1], end, indices, data, self.inverse, self.directions.reversed())
 
     def sweep(
         self, b: Floats, x: Floats, count: int, enough: float = TOLERANCE, flat: float = 0.0
@@ -70,8 +74,8 @@ class System:
         if len(x) >= SPLIT:  # by size alone: the result does not depend on the threads
             return _in_halves(self, b, x, count, enough, flat)
         halfway, last = _gauss_seidel(
-            self.begin, self.end, self.indices, self.data, self.inverse, b, x, count, enough,
-            flat,
+            self.begin, self.end, self.indices, self.data, self.inverse,
+            self.directions.orders, self.directions.cycle, b, x, count, enough, flat,
         )  # fmt: skip
         return float(halfway), float(last)
 
@@ -110,8 +114,10 @@ def _turn(begin, end, indices, data, used, out_indices, out_data):  # type: igno
 
 
 @njit(cache=True, nogil=True)
-def _gauss_seidel(begin, end, indices, data, inverse, b, x, count, enough, flat):  # type: ignore[no-untyped-def]
-    """Sweep over the components, forwards and backwards in turn, using each as soon as known.
+def _gauss_seidel(  # type: ignore[no-untyped-def]
+    begin, end, indices, data, inverse, orders, cycle, b, x, count, enough, flat
+):
+    """Sweep over the components, in all directions in turn, using each as soon as known.
 
     Staying put is summed up at once, so a chain of slow cells takes one sweep in its direction.
     From x >= b + M x every sweep lowers x, from below it raises it. Returns the largest relative
@@ -122,9 +128,11 @@ def _gauss_seidel(begin, end, indices, data, inverse, b, x, count, enough, flat)
     halfway, change, top = np.inf, np.inf, 0.0
     for sweep in range(count):
         measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
+        order, downwards = cycle[sweep % len(cycle)]
         found = _sweep(
-            0, len(b), begin, end, indices, data, inverse, b, x, x, sweep % 2 == 1, measured, top
-        )
+            0, len(b), begin, end, indices, data, inverse, b, x, x,
+            orders[order], downwards == 1, measured, top,
+        )  # fmt: skip
         if measured:
             change, top = found[0], found[2]
             if not top < CEILING:
@@ -140,9 +148,9 @@ def _gauss_seidel(begin, end, indices, data, inverse, b, x, count, enough, flat)
 
 @njit(cache=True, nogil=True)
 def _sweep(  # type: ignore[no-untyped-def]
-    first, last, begin, end, indices, data, inverse, b, old, x, backwards, measured, top
+    first, last, begin, end, indices, data, inverse, b, old, x, order, downwards, measured, top
 ):
-    """Sweep over a range: ``x`` inside it, ``old`` outside; ``top`` was the largest component.
+    """Sweep over a range, in some order: ``x`` inside it, ``old`` outside; ``top`` was the largest.
 
     Returns the largest relative change, the largest absolute one, and the largest component.
     """
@@ -150,7 +158,7 @@ def _sweep(  # type: ignore[no-untyped-def]
     first, last = np.uint64(first), np.uint64(last)
     alone = first == np.uint64(0) and last == np.uint64(len(b))
     for t in range(last - first):
-        i = last - ONE - t if backwards else first + t
+        i = np.uint64(order[last - first - ONE - t if downwards else t])
         y = b[i]
         if alone:
             for e in range(begin[i], end[i]):
@@ -175,22 +183,28 @@ def _in_halves(
 ) -> tuple[float, float]:
     """Make the same sweeps in two halves at a time, each with the other's last values."""
     n = len(x)
-    halves = ((0, n // 2), (n // 2, n))
+    cycle, orders = system.directions.cycle, system.directions.orders
+    halves = (0, n // 2), (n // 2, n)
+    inside = [
+        [order[(first <= order) & (order < last)] for order in orders] for first, last in halves
+    ]
     halfway, change, top = np.inf, np.inf, 0.0
     now, then = x.copy(), x
 
-    def half(task: tuple[int, int, int, bool, float, Floats, Floats]) -> Any:
-        first, last, sweep, measured, highest, old, new = task
+    def half(task: tuple[int, int, bool, float, Floats, Floats]) -> Any:
+        part, sweep, measured, highest, old, new = task
+        first, last = halves[part]
         new[first:last] = old[first:last]
+        order, downwards = cycle[sweep % len(cycle)]
         return _sweep(
             first, last, system.begin, system.end, system.indices, system.data, system.inverse,
-            b, old, new, sweep % 2 == 1, measured, highest,
+            b, old, new, inside[part][order], downwards == 1, measured, highest,
         )  # fmt: skip
 
     for sweep in range(count):
         measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
         now, then = then, now
-        tasks = [(*ends, sweep, measured, top, now, then) for ends in halves]
+        tasks = [(part, sweep, measured, top, now, then) for part in range(2)]
         found = threads.each(half, tasks)
         if not measured:
             continue

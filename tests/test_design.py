@@ -28,7 +28,7 @@ systems.*
 systems
 declarations
 problem
-sampling memory threads
+sampling memory threads directions
 sweeps
 peeling merging
 linear
