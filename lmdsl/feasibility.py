@@ -8,10 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bellman, bounds, linear
+from lmdsl import bellman, bounds, leaps, linear
 from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP
-from lmdsl.policy import MOST_SWEEPS, iterate, peeled, stability_vector
+from lmdsl.policy import iterate, peeled, stability_vector
+from lmdsl.sweeps import TOLERANCE
+
+SWEEPS, MOST_ROUNDS = 30, 8
+"""Sweeps after which a proof is given up unless they moved it much less than the ones before."""
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
@@ -56,17 +60,23 @@ def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
     """Make of a guess a proof that a policy is g-stabilizing; None where it takes too long.
 
     Where its own value is soon known and every cost positive, it is the proof; else the guess is
-    swept towards the unit-cost value for a while.
+    swept towards the unit-cost value, as long as that is in sight.
     """
     rows, cost = peeled(lp, pair, lp.growth), lp.cost[pair]
     paid = rows.small and bool((cost > 0).all())
     for paid_for in (cost, np.ones(lp.n)) if paid else (np.ones(lp.n),):
-        proof = w.copy()
-        left = linear.advance(rows, paid_for, proof, MOST_SWEEPS, 0.0, 0.25)
-        if bounds.decrease(lp, pair, proof, lp.growth) is not None:
-            return proof
+        proof, before = w.copy(), np.inf
+        for _ in range(MOST_ROUNDS):
+            left = linear.advance(rows, paid_for, proof, SWEEPS, 0.0, 0.25)
+            if not TOLERANCE < left < 0.3 * before:
+                break
+            before = left
         if left == np.inf:
             break
+        if left > TOLERANCE and not leaps.lift(rows.system, paid_for, proof):
+            continue
+        if bounds.decrease(lp, pair, proof, lp.growth) is not None:
+            return proof
     return None
 
 

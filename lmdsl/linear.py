@@ -32,10 +32,8 @@ MAX_SWEEPS = 200_000
 MAX_FACTORED = 100_000
 DENSE = 50
 KRYLOV, KRYLOV_STEPS = 1000, 200
-LEAP_SWEEPS, LEAP_STEPS = 4, 16
-LEAST_FALL, FARTHEST = 1e-10, 1e4
-"""A leap is not taken for a smaller relative fall, nor farther: rounding would decide its end."""
-ROUNDING = 1e-13
+FEW_SWEEPS, MANY_SWEEPS = 100, 300
+"""Sweeps that are made rather than Krylov's steps, and rather than a sparse factorisation."""
 PER_CORE = 20
 """The core may be swept more often than all cells, up to so many times."""
 
@@ -164,31 +162,6 @@ def advance(peeled: Peeled, b: Floats, x: Floats, count: int, enough: float, fla
     return change if peeled.substitute(b, x) else np.inf
 
 
-def leap(system: System, b: Floats, x: Floats) -> float:
-    """Lower x >= b + M x in place, mostly along the mode in which sweeps stall; return how far.
-
-    A few sweeps, then Jacobi steps, which take r = x - (b + M x) from x and turn it into M r: soon
-    along the slowest mode. x - t r >= b + M (x - t r) is t (r - M r) <= r, so the largest t that
-    all components allow is safe; it is 1 / (1 - rate) for a mode alone. Returns t, 1 where nothing
-    was gained over a Jacobi step or x is not above b + M x, up to rounding. (With the diagonal of M
-    solved for, as in sweeps.)
-    """
-    system.sweep(b, x, LEAP_SWEEPS)
-    r = x - system.inverse * b - _moved(system, x)
-    if not ((r >= -ROUNDING * x).all() and (r > LEAST_FALL * x).any()):
-        return 1.0
-    np.maximum(r, 0.0, out=r)
-    for _ in range(LEAP_STEPS):
-        x -= r
-        r = _moved(system, r)
-    if not (r > LEAST_FALL * x).any():
-        return 1.0
-    rate = np.divide(_moved(system, r), r, out=np.ones(len(r)), where=r > 0).min()
-    t = min(1.0 / max(1.0 - float(rate), 1e-300), FARTHEST)
-    x -= (t * (1 - 1e-6)) * r
-    return t
-
-
 def _solve(
     system: System,
     b: Floats,
@@ -206,7 +179,7 @@ def _solve(
     if change <= enough:
         return x
     guess = None
-    if len(b) >= KRYLOV and not _soon(change, rate):
+    if len(b) >= KRYLOV and not _soon(change, rate, FEW_SWEEPS):
         guess = _krylov(system, b, x, stop)
     if guess is not None:
         x = guess
@@ -215,7 +188,7 @@ def _solve(
         change, rate = _trial(system, b, x, enough, flat)
         if change <= enough:
             return x
-    if not _soon(change, rate):
+    if not _soon(change, rate, MANY_SWEEPS):
         direct, small_enough = solve_by_class(matrix(), b, stop)
         if direct is not None or small_enough:
             return direct
@@ -233,28 +206,32 @@ def _solve(
 def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
     """Return a better guess by BiCGSTAB (van der Vorst 1992), None where it breaks down.
 
-    It takes one step for each mode that hinders sweeps, such as the slow escape from a well-mixed
-    set. A solution >= 0 is the right one: the left Perron vector of a class with spectral radius 1
+    A cycle of sweeps in all directions maps x to S x + s; it solves x - S x = s, in one step for
+    each mode that hinders sweeps, such as the slow escape from a well-mixed set. A solution >= 0 is
+    the right one: the left Perron vector of a class with spectral radius 1
     or more contradicts x >= b + M x > 0 there. SciPy's breaks down at absolute sizes, and its sums
     depend on the number of BLAS threads.
     """
-    known = system.inverse * b
-    unit = float(known.max())
+    count, zero = len(system.directions.cycle), np.zeros(len(b))
+
+    def swept(c: Floats, v: Floats) -> Floats:
+        v = v.copy()
+        system.sweep(c, v, count, enough=-1.0, flat=-1.0)
+        return v
+
+    unit = float((system.inverse * b).max())
     if not 0 < unit < CEILING or system.inverse.max() >= NEVER:
         return None
-    known /= unit
     with np.errstate(all="ignore"):
-        y = _bicgstab(system, known, x / unit, stop)
+        known = swept(b / unit, zero)
+        y = _bicgstab(lambda v: v - swept(zero, v), known, x / unit, stop)
     if not np.isfinite(y).all() or y.min() < -1e-9 * y.max():
         return None
     return np.maximum(unit * y, b)
 
 
-def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop) -> Floats:
-    """Solve x - D^-1 (M - own) x = b with D = 1 - own, own the diagonal of M, to 13 digits."""
-
-    def applied(v: Floats) -> Floats:
-        return v - _moved(system, v)
+def _bicgstab(applied: Callable[[Floats], Floats], b: Floats, x: Floats, stop: Stop) -> Floats:
+    """Solve applied(x) = b to 13 digits."""
 
     def dot(u: Floats, v: Floats) -> Any:
         return (u * v).sum()
@@ -283,13 +260,6 @@ def _bicgstab(system: System, b: Floats, x: Floats, stop: Stop) -> Floats:
     return x
 
 
-def _moved(system: System, v: Floats) -> Floats:
-    """Return D^-1 (M - own) v with D = 1 - own, own the diagonal of M: one Jacobi step."""
-    out = np.empty(len(v))
-    _off_diagonal(system.begin, system.end, system.indices, system.data, v, out)
-    return system.inverse * out
-
-
 def _pays(system: System, b: Floats) -> NDArray[np.bool_]:
     """Return where x > 0: the cells from which some b > 0 can be reached."""
     pays, before = b > 0, system.transposed()
@@ -297,10 +267,11 @@ def _pays(system: System, b: Floats) -> NDArray[np.bool_]:
     return pays
 
 
-def _soon(change: float, rate: float) -> bool:
+def _soon(change: float, rate: float, sweeps: int) -> bool:
+    """Return whether so many sweeps more should suffice."""
     if not (change < np.inf and rate < 1):
         return False
-    return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < 300)
+    return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < sweeps)
 
 
 def _trial(system: System, b: Floats, x: Floats, enough: float, flat: float) -> tuple[float, float]:
@@ -390,15 +361,6 @@ def _factors(inner: Any) -> Callable[[Floats], Floats]:
 def _dense(inner: Any) -> Callable[[Floats], Floats]:
     system = np.eye(inner.shape[0]) - inner.toarray()
     return lambda known: np.linalg.solve(system, known)
-
-
-@njit(cache=True, nogil=True)
-def _off_diagonal(begin, end, indices, data, v, out):  # type: ignore[no-untyped-def]
-    for i in range(np.uint64(len(begin))):
-        y = 0.0
-        for e in range(begin[i], end[i]):
-            y += data[e] * v[indices[e]]
-        out[i] = y
 
 
 @njit(cache=True, nogil=True)

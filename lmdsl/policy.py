@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from lmdsl import bellman, bounds, graph, linear
+from lmdsl import bellman, bounds, graph, leaps, linear
 from lmdsl.linear import Stop as Stop
 from lmdsl.linear import Stopped, never
 from lmdsl.lp import StabilizationLP
@@ -159,7 +159,7 @@ def iterate(
     Each step changes every control for which another one is better by a relative 1e-12. Then the
     new policy u is evaluated: to the end where few cells lie on cycles, else by sweeps
     V <- T_u V, about as long as the improvement took, or by a leap along the one mode in which they
-    stall (:func:`lmdsl.linear.leap`); not at all after the first step, and every
+    stall (:func:`lmdsl.leaps.leap`); not at all after the first step, and every
     second time where few controls changed. V >= T_u V stays true whatever the number of sweeps, so
     V falls and every policy on the way is gamma-stabilizing (docs/mathematics.md, Policy
     iteration); only a policy evaluated to the end is returned as the last.
@@ -187,7 +187,7 @@ def iterate(
                 fall = 0.0 if rows.small else _fall(V, x)
                 far, left = 0.0, np.inf
                 if stalls and not rows.small:
-                    far = linear.leap(rows.system, screen.paid, x)
+                    far = leaps.leap(rows.system, screen.paid, x)
                     stalls = 2 * far > sweeps
                 if far < sweeps:
                     left = linear.advance(rows, screen.paid, x, sweeps, 0.1 * fall, 0.0)

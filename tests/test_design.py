@@ -30,7 +30,7 @@ declarations
 problem
 sampling memory threads directions
 sweeps
-peeling merging
+peeling merging leaps
 linear
 partition rows
 boxes lines

@@ -1,11 +1,15 @@
 """Evaluating a policy: leaps along a slow mode, and systems that sweeps do not solve."""
 
+import copy
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from models import random_lp
+from problems import made
 
-from lmdsl import linear, policy, sweeps
+import lmdsl as lm
+from lmdsl import feasibility, leaps, linear, policy, sweeps
 from lmdsl.peeling import Peeled
 from lmdsl.screening import Screen
 
@@ -45,7 +49,7 @@ def test_a_leap_stays_above_its_equation(escape, make):
         b = rng.uniform(0.1, 1.0, n)
         x = above(M, b, rng)
         before, V = x.copy(), exact(M, b)
-        t = linear.leap(sweeps.System.of(M), b, x)
+        t = leaps.leap(sweeps.System.of(M), b, x)
         assert t >= 1
         assert (x <= before * (1 + 1e-15)).all()
         assert (x >= V * (1 - 1e-12)).all()
@@ -59,7 +63,7 @@ def test_a_leap_removes_the_one_slow_mode():
     system, V = sweeps.System.of(M), exact(M, b)
     start = above(M, b, rng)
     x, plain = start.copy(), start.copy()
-    t = linear.leap(system, b, x)
+    t = leaps.leap(system, b, x)
     system.sweep(b, plain, 20)
     assert t == pytest.approx(100, rel=0.2)  # 1 / (1 - rate)
     assert np.abs(x / V - 1).max() < 0.1 * np.abs(plain / V - 1).max()
@@ -71,10 +75,70 @@ def test_a_leap_is_not_taken_from_below_nor_at_the_solution():
     b = rng.uniform(0.1, 1.0, 300)
     system, V = sweeps.System.of(M), exact(M, b)
     below, swept = 0.5 * V, 0.5 * V
-    assert linear.leap(system, b, below) == 1
-    system.sweep(b, swept, linear.LEAP_SWEEPS)
+    assert leaps.leap(system, b, below) == 1
+    system.sweep(b, swept, leaps.SWEEPS)
     np.testing.assert_array_equal(below, swept)
-    assert linear.leap(system, b, V) == 1
+    assert leaps.leap(system, b, V) == 1
+
+
+@pytest.mark.parametrize("escape", [0.5, 0.02, 1e-3, 1e-6])
+def test_lifted_vectors_prove_that_a_mixing_set_is_left(escape):
+    rng = np.random.default_rng(6)
+    for n in (1, 2, 50, 400):
+        M, b = mixing(n, escape, rng), rng.uniform(0.1, 1.0, n)
+        V = exact(M, b)
+        for start in (np.zeros(n), V * rng.random(n), V, V * rng.uniform(0.5, 1.5, n)):
+            x, system = start.copy(), sweeps.System.of(M)
+            system.sweep(b, x, 20)
+            lifted = leaps.lift(system, b, x)
+            # Near V only rounding is left to go by; the slower the escape, the more steps it takes.
+            assert lifted or (start > 0.99 * V).any() or escape < 1e-3
+            assert not lifted or (x >= (b + M @ x) * (1 - 1e-12)).all()
+
+
+@pytest.mark.parametrize("growth", [1.0, 1.001, 3.0])
+def test_what_is_not_left_is_not_lifted(growth):
+    rng = np.random.default_rng(7)
+    for n in (1, 2, 50, 400):
+        M, b = mixing(n, 0.0, rng) * growth, np.ones(n)
+        x = np.ones(n)
+        if leaps.lift(sweeps.System.of(M), b, x):  # what rounding made of it proves nothing
+            assert not (x > b + M @ x).all()
+
+
+def test_what_is_carried_along_is_not_lifted_but_swept():
+    M = transport(400, np.random.default_rng(8))
+    b = np.ones(400)
+    x = b.copy()
+    lifted = leaps.lift(sweeps.System.of(M), b, x)
+    assert not lifted or (x >= (b + M @ x) * (1 - 1e-12)).all()
+
+
+def test_a_policy_is_proved_stabilizing_where_mass_hardly_escapes(monkeypatch):
+    lp = random_lp(np.random.default_rng(9), cells=500, samples=6, spread=6, absorb=1e-3)
+    pair, ones, lifted = lp.tree[1], np.ones(lp.n), []
+    lift = leaps.lift
+    monkeypatch.setattr(leaps, "lift", lambda *a: lifted.append(lift(*a)) or lifted[-1])
+    assert feasibility._proved(lp, pair, ones) is not None
+    assert lifted == [True]
+    assert policy.peeled(lp, pair, 1.0).system.sweep(ones, ones.copy(), 200)[1] > 1e-3
+
+
+def test_a_policy_is_proved_stabilizing_as_long_as_sweeps_gain(monkeypatch):
+    """A slow pendulum at gamma = 1.02: 30 sweeps gain two digits of w, which needs four."""
+    data = copy.deepcopy(dict(lm.systems.InvertedPendulum.problem))
+    for axis in data["state_box"].values():
+        axis["cells"] = 100
+    system = {**data["system"], "step": 0.02, "substeps": 1}
+    lp = lm.compile(made({**data, "system": system, "on_exit": "clip", "gamma": 1.02}))
+    advance, calls = linear.advance, []
+    monkeypatch.setattr(linear, "advance", lambda *a: calls.append(a[3]) or advance(*a))
+    horizon = 4.0 * lp.tree[0].max()
+    start, unit = np.full(lp.n, horizon), np.ones(lp.K)
+    done = policy.iterate(lp, lp.tree[1], start, 1 - 1 / horizon, unit, limit=6)
+    calls.clear()
+    assert feasibility._proved(lp, done.pair, done.value) is not None
+    assert len(calls) > 1
 
 
 def test_policies_of_mixing_models_are_the_same_with_and_without_leaps(monkeypatch):
@@ -88,7 +152,7 @@ def test_policies_of_mixing_models_are_the_same_with_and_without_leaps(monkeypat
         start = policy.bound(lp, pair, w)
         done = policy.iterate(lp, pair, start)
         with monkeypatch.context() as patch:
-            patch.setattr(linear, "leap", lambda *_: 1.0)
+            patch.setattr(leaps, "leap", lambda *_: 1.0)
             plain = policy.iterate(lp, pair, start)
         np.testing.assert_allclose(done.value, plain.value, rtol=1e-11)
         screen = Screen(lp)
