@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bellman, bounds, leaps, linear
+from lmdsl import bellman, bounds, linear
 from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.policy import iterate, peeled, stability_vector
@@ -73,9 +73,10 @@ def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
             before = left
         if left == np.inf:
             break
-        if left > TOLERANCE and not leaps.lift(rows.system, paid_for, proof):
-            continue
         if bounds.decrease(lp, pair, proof, lp.growth) is not None:
+            return proof
+        lifted = left > TOLERANCE and linear.lift(rows, paid_for, proof)
+        if lifted and bounds.decrease(lp, pair, proof, lp.growth) is not None:
             return proof
     return None
 

@@ -218,7 +218,9 @@ class _Parser:
             return _Token("end", "", start)
         match = _TOKEN.match(self.text, start)
         if match is None:
-            raise _error(start, f"{shown(self.text[start])} is not part of the formula language")
+            hint = "; write ** for powers" if self.text[start] == "^" else ""
+            what = f"{shown(self.text[start])} is not part of the formula language"
+            raise _error(start, what + hint)
         kind, text = str(match.lastgroup), match.group()
         if kind == "name" and keyword.iskeyword(text):
             raise _error(start, f"{shown(text)} is a Python keyword, not part of formulas")

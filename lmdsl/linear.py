@@ -22,6 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from lmdsl import leaps
 from lmdsl.peeling import Peeled
 from lmdsl.sweeps import CEILING, NEVER, TOLERANCE, System
 
@@ -160,6 +161,20 @@ def advance(peeled: Peeled, b: Floats, x: Floats, count: int, enough: float, fla
             return np.inf
         x[peeled.core] = y
     return change if peeled.substitute(b, x) else np.inf
+
+
+def lift(peeled: Peeled, b: Floats, x: Floats) -> bool:
+    """Raise x in place to x >= b + M x, along the slowest mode; False where that fails.
+
+    It is the mode of the core where that is small, else of all cells.
+    """
+    if not peeled.small:
+        return leaps.lift(peeled.system, b, x)
+    y = x[peeled.core]
+    if not leaps.lift(peeled.inner, b[peeled.core], y):
+        return False
+    x[peeled.core] = y
+    return peeled.substitute(b, x)
 
 
 def _solve(

@@ -117,11 +117,27 @@ def test_what_is_carried_along_is_not_lifted_but_swept():
 def test_a_policy_is_proved_stabilizing_where_mass_hardly_escapes(monkeypatch):
     lp = random_lp(np.random.default_rng(9), cells=500, samples=6, spread=6, absorb=1e-3)
     pair, ones, lifted = lp.tree[1], np.ones(lp.n), []
-    lift = leaps.lift
-    monkeypatch.setattr(leaps, "lift", lambda *a: lifted.append(lift(*a)) or lifted[-1])
+    lift = linear.lift
+    monkeypatch.setattr(linear, "lift", lambda *a: lifted.append(lift(*a)) or lifted[-1])
     assert feasibility._proved(lp, pair, ones) is not None
     assert lifted == [True]
     assert policy.peeled(lp, pair, 1.0).system.sweep(ones, ones.copy(), 200)[1] > 1e-3
+
+
+@pytest.mark.parametrize("outside", [0, 30, 900])
+def test_a_small_core_alone_is_lifted(outside):
+    rng = np.random.default_rng(10)
+    inner = mixing(300, 1e-2, rng)
+    into = sp.csr_array(rng.random((outside, 300)) * (rng.random((outside, 300)) < 0.01))
+    M = sp.csr_array(sp.block_array([[inner, None], [into, sp.csr_array((outside, outside))]]))
+    peeled = Peeled.of(sweeps.System.of(M))
+    assert 250 < len(peeled.core) <= 300
+    assert peeled.small == (outside == 900)
+    b = np.ones(300 + outside)
+    x = b.copy()
+    linear.advance(peeled, b, x, 1, 0.0, 0.0)
+    assert linear.lift(peeled, b, x)
+    assert (x >= (b + M @ x) * (1 - 1e-12)).all()
 
 
 def test_a_policy_is_proved_stabilizing_as_long_as_sweeps_gain(monkeypatch):
