@@ -239,8 +239,8 @@ def bound(lp: StabilizationLP, pair: Pairs, w: Floats | None = None) -> Floats |
         V: Floats = w * factor
     if not (V < CEILING).all():
         return None
-    if lp.gamma == lp.growth and bool((d * (factor * (1 - 1e-2)) <= cost).all()):
-        return V  # within a percent of the value already
+    if bool((d * (factor * (1 - 1e-2)) <= cost).all()):
+        return V  # within a percent of the value at weight g already
     x = V.copy()
     linear.advance(peeled(lp, pair, lp.gamma), cost, x, MOST_SWEEPS, 1e-2, 0.0)
     return np.minimum(x, V)
