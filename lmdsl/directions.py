@@ -9,15 +9,21 @@ Comp. 74, 2005). From one sweep to the next a single axis turns, the first axis 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_FLIPPED = 3
-"""Axes besides the first that are visited in both directions: the last ones of many."""
+MOST_FLIPPED = 2
+"""Axes besides the first that are visited in both directions: the last ones of many.
+
+More directions take more memory, and each sweep longer: cells are read less in a row.
+"""
+
+FEW = 4
+"""Of so many cells one: these are sorted anew, more are picked from the orders of all."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +38,15 @@ class Directions:
         Cells per axis.
     against
         The combinations follow each other the other way round, as transposed systems want it.
+    whole, chosen
+        The cells of which these are some, and their positions there.
     """
 
     cells: NDArray[np.integer[Any]]
     shape: tuple[int, ...]
     against: bool = False
+    whole: Directions | None = None
+    chosen: NDArray[np.integer[Any]] | None = None
 
     @classmethod
     def line(cls, n: int) -> Directions:
@@ -45,11 +55,14 @@ class Directions:
 
     def among(self, chosen: NDArray[np.integer[Any]]) -> Directions:
         """Return the orders of some of the cells, given by ascending positions."""
-        return Directions(self.cells[chosen], self.shape, self.against)
+        return Directions(self.cells[chosen], self.shape, self.against, self, chosen)
 
     def reversed(self) -> Directions:
         """Return the same orders, following each other the other way round."""
-        return Directions(self.cells, self.shape, not self.against)
+        other = replace(self, against=not self.against)
+        if "orders" in vars(self):
+            vars(other)["orders"] = self.orders
+        return other
 
     @cached_property
     def orders(self) -> NDArray[np.uint32]:
@@ -59,6 +72,13 @@ class Directions:
         """
         n, axes = len(self.cells), self._flipped
         orders = np.empty((2 ** len(axes), n), dtype=np.uint32)
+        if self.whole is not None and self.chosen is not None and FEW * n > len(self.whole.cells):
+            number = np.full(len(self.whole.cells), n, dtype=np.uint32)
+            number[self.chosen] = np.arange(n, dtype=np.uint32)
+            for k, order in enumerate(self.whole.orders):
+                found = number[order]
+                orders[k] = found[found < n]
+            return orders
         orders[0] = np.arange(n)
         for k in range(1, len(orders)):
             index, stride = self.cells.copy(), 1
@@ -69,6 +89,15 @@ class Directions:
                 stride *= count
             orders[k] = np.argsort(index, kind="stable")  # lines of cells, turned: nearly sorted
         return orders
+
+    @cached_property
+    def in_halves(self) -> NDArray[np.uint32]:
+        """The same orders of the first half of the cells, then of the second."""
+        middle = len(self.cells) // 2
+        return np.array([
+            np.concatenate([order[order < middle], order[order >= middle]])
+            for order in self.orders
+        ])  # fmt: skip
 
     @cached_property
     def cycle(self) -> NDArray[np.int64]:

@@ -56,27 +56,32 @@ class Undecided:
     lower: float
 
 
-def _proved(lp: StabilizationLP, pair: Pairs, w: Floats) -> Floats | None:
+def _proved(lp: StabilizationLP, pair: Pairs, w: Floats, stop: Stop) -> Floats | None:
     """Make of a guess a proof that a policy is g-stabilizing; None where it takes too long.
 
     Where its own value is soon known and every cost positive, it is the proof; else the guess is
     swept towards the unit-cost value, as long as that is in sight.
     """
     rows, cost = peeled(lp, pair, lp.growth), lp.cost[pair]
+
+    def proves(guess: Floats) -> bool:
+        return bounds.decrease(lp, pair, guess, lp.growth) is not None
+
     paid = rows.small and bool((cost > 0).all())
     for paid_for in (cost, np.ones(lp.n)) if paid else (np.ones(lp.n),):
         proof, before = w.copy(), np.inf
         for _ in range(MOST_ROUNDS):
             left = linear.advance(rows, paid_for, proof, SWEEPS, 0.0, 0.25)
-            if not TOLERANCE < left < 0.3 * before:
+            if left == np.inf:
+                return None
+            if proves(proof):
+                return proof
+            if left > 0.3 * before or left <= TOLERANCE:
                 break
+            if stop():
+                raise Stopped
             before = left
-        if left == np.inf:
-            break
-        if bounds.decrease(lp, pair, proof, lp.growth) is not None:
-            return proof
-        lifted = left > TOLERANCE and linear.lift(rows, paid_for, proof)
-        if lifted and bounds.decrease(lp, pair, proof, lp.growth) is not None:
+        if left > TOLERANCE and linear.lift(rows, paid_for, proof) and proves(proof):
             return proof
     return None
 
@@ -108,7 +113,7 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
     for k in range(4 if level.max() <= NEAR else 0):
         better = bellman.rise(lp, V, g, k % 2 == 1)
         V = better.value
-        w = _proved(lp, better.pair, V) if k in (0, 3) else None
+        w = _proved(lp, better.pair, V, stop) if k in (0, 3) else None
         if w is not None:
             yield Feasible(better.pair, w)
             return
@@ -118,7 +123,7 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
         for _ in range(4):
             done = iterate(lp, pair, value, at, unit, stop=stop, limit=6)
             pair, value = done.pair, done.value
-            w = _proved(lp, pair, value)
+            w = _proved(lp, pair, value, stop)
             yield Undecided(pair, at) if w is None else Feasible(pair, w)
             if stop():
                 return

@@ -32,7 +32,8 @@ TRIAL_SWEEPS = 60
 MAX_SWEEPS = 200_000
 MAX_FACTORED = 100_000
 DENSE = 50
-KRYLOV, KRYLOV_STEPS = 1000, 200
+KRYLOV, KRYLOV_STEPS, KRYLOV_SWEEPS = 1000, 200, 1600
+"""Least size of a system, most steps, and most sweeps in them, two cycles each."""
 FEW_SWEEPS, MANY_SWEEPS = 100, 300
 """Sweeps that are made rather than Krylov's steps, and rather than a sparse factorisation."""
 PER_CORE = 20
@@ -234,19 +235,24 @@ def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
         system.sweep(c, v, count, enough=-1.0, flat=-1.0)
         return v
 
-    unit = float((system.inverse * b).max())
-    if not 0 < unit < CEILING or system.inverse.max() >= NEVER:
+    if system.inverse.max() >= NEVER:
         return None
     with np.errstate(all="ignore"):
-        known = swept(b / unit, zero)
-        y = _bicgstab(lambda v: v - swept(zero, v), known, x / unit, stop)
-    if not np.isfinite(y).all() or y.min() < -1e-9 * y.max():
+        unit = float((system.inverse * b).max())
+        if not 0 < unit < CEILING:
+            return None
+        known, steps = swept(b / unit, zero), min(KRYLOV_STEPS, KRYLOV_SWEEPS // (2 * count))
+        y = _bicgstab(lambda v: v - swept(zero, v), known, x / unit, steps, stop)
+        guess = np.maximum(unit * y, b)
+    if not (guess < CEILING).all() or y.min() < -1e-9 * y.max():
         return None
-    return np.maximum(unit * y, b)
+    return guess
 
 
-def _bicgstab(applied: Callable[[Floats], Floats], b: Floats, x: Floats, stop: Stop) -> Floats:
-    """Solve applied(x) = b to 13 digits."""
+def _bicgstab(
+    applied: Callable[[Floats], Floats], b: Floats, x: Floats, steps: int, stop: Stop
+) -> Floats:
+    """Solve applied(x) = b to 13 digits, or make so many steps."""
 
     def dot(u: Floats, v: Floats) -> Any:
         return (u * v).sum()
@@ -255,7 +261,7 @@ def _bicgstab(applied: Callable[[Floats], Floats], b: Floats, x: Floats, stop: S
     r = b - applied(x)
     shadow, p, rho = r, r, dot(r, r)
     enough = 1e-26 * dot(b, b)
-    for _ in range(KRYLOV_STEPS):
+    for _ in range(steps):
         if not dot(r, r) > enough or rho == 0.0:
             break
         if stop():

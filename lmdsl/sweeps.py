@@ -183,11 +183,8 @@ def _in_halves(
 ) -> tuple[float, float]:
     """Make the same sweeps in two halves at a time, each with the other's last values."""
     n = len(x)
-    cycle, orders = system.directions.cycle, system.directions.orders
+    cycle, orders = system.directions.cycle, system.directions.in_halves
     halves = (0, n // 2), (n // 2, n)
-    inside = [
-        [order[(first <= order) & (order < last)] for order in orders] for first, last in halves
-    ]
     halfway, change, top = np.inf, np.inf, 0.0
     now, then = x.copy(), x
 
@@ -198,7 +195,7 @@ def _in_halves(
         order, downwards = cycle[sweep % len(cycle)]
         return _sweep(
             first, last, system.begin, system.end, system.indices, system.data, system.inverse,
-            b, old, new, inside[part][order], downwards == 1, measured, highest,
+            b, old, new, orders[order, first:last], downwards == 1, measured, highest,
         )  # fmt: skip
 
     for sweep in range(count):

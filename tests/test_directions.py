@@ -58,8 +58,19 @@ def test_some_of_the_cells_are_visited_in_the_same_order(of, data):
         st.booleans(), min_size=len(of.cells), max_size=len(of.cells)
     )))  # fmt: skip
     part = of.among(chosen)
+    if data.draw(st.booleans()):
+        part = part.reversed().reversed()
     for found, order in zip(visits(part), visits(of), strict=True):
         np.testing.assert_array_equal(chosen[found], order[np.isin(order, chosen)])
+
+
+@given(parts_of_boxes())
+@settings(deadline=None)
+def test_halves_are_visited_in_the_same_order(of):
+    middle = len(of.cells) // 2
+    for order, halved in zip(of.orders, of.in_halves, strict=True):
+        np.testing.assert_array_equal(halved[:middle], order[order < middle])
+        np.testing.assert_array_equal(halved[middle:], order[order >= middle])
 
 
 def test_cells_without_a_box_are_swept_up_and_down():
@@ -82,8 +93,11 @@ def drift(shape, signs):
 
 
 @pytest.mark.parametrize("transposed", [False, True])
-@pytest.mark.parametrize("shape", [(30,), (12, 17), (6, 7, 8), (3, 4, 5, 4)])
-def test_one_cycle_solves_a_flow_whatever_its_direction(shape, transposed):
+@pytest.mark.parametrize(
+    ("shape", "cycles"), [((30,), 1), ((12, 17), 1), ((6, 7, 8), 1), ((3, 4, 5, 4), 4)]
+)
+def test_a_cycle_solves_a_flow_whatever_its_direction(shape, cycles, transposed):
+    """With more than three axes the first ones turn together: some cycles more."""
     for signs in product((1, -1), repeat=len(shape)):
         M = drift(shape, signs)
         size = M.shape[0]
@@ -93,7 +107,7 @@ def test_one_cycle_solves_a_flow_whatever_its_direction(shape, transposed):
             system, matrix = system.transposed(), M.T
         b = np.linspace(1.0, 2.0, size)
         x = b.copy()
-        system.sweep(b, x, len(system.directions.cycle), enough=0.0)
+        system.sweep(b, x, cycles * len(system.directions.cycle), enough=0.0)
         np.testing.assert_allclose(x - matrix @ x, b, rtol=1e-13)
 
 

@@ -119,7 +119,7 @@ def test_a_policy_is_proved_stabilizing_where_mass_hardly_escapes(monkeypatch):
     pair, ones, lifted = lp.tree[1], np.ones(lp.n), []
     lift = linear.lift
     monkeypatch.setattr(linear, "lift", lambda *a: lifted.append(lift(*a)) or lifted[-1])
-    assert feasibility._proved(lp, pair, ones) is not None
+    assert feasibility._proved(lp, pair, ones, linear.never) is not None
     assert lifted == [True]
     assert policy.peeled(lp, pair, 1.0).system.sweep(ones, ones.copy(), 200)[1] > 1e-3
 
@@ -153,7 +153,7 @@ def test_a_policy_is_proved_stabilizing_as_long_as_sweeps_gain(monkeypatch):
     start, unit = np.full(lp.n, horizon), np.ones(lp.K)
     done = policy.iterate(lp, lp.tree[1], start, 1 - 1 / horizon, unit, limit=6)
     calls.clear()
-    assert feasibility._proved(lp, done.pair, done.value) is not None
+    assert feasibility._proved(lp, done.pair, done.value, linear.never) is not None
     assert len(calls) > 1
 
 
@@ -184,6 +184,17 @@ def test_a_symmetric_walk_is_solved(n):
     M, b = sp.csr_array(sp.dia_array((np.array([half, half]), [-1, 1]), shape=(n, n))), np.ones(n)
     i = np.arange(1, n + 1)
     np.testing.assert_allclose(linear.solve(M, b), i * (n + 1.0 - i), rtol=1e-9)
+
+
+@pytest.mark.parametrize("own", [1.0, 1.5])
+@pytest.mark.parametrize("size", [1.0, 100.0, 1e300])
+def test_krylov_refuses_cells_that_stay_put_for_ever(own, size):
+    rng = np.random.default_rng(11)
+    M = sp.lil_array(mixing(1500, 0.1, rng))
+    M[7, 7] = own
+    M, b = sp.csr_array(M), np.full(1500, size)
+    assert linear._krylov(sweeps.System.of(M), b, b.copy(), linear.never) is None
+    assert linear.solve(M, b) is None
 
 
 def test_krylov_finds_the_slow_mode_of_a_well_mixed_set():
