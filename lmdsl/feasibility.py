@@ -14,12 +14,12 @@ from lmdsl.lp import StabilizationLP
 from lmdsl.policy import iterate, peeled, stability_vector
 from lmdsl.sweeps import TOLERANCE
 
-SWEEPS, MOST_ROUNDS = 30, 8
-"""Sweeps after which a proof is given up unless they moved it much less than the ones before."""
-
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+
+SWEEPS, MOST_ROUNDS = 30, 8
+"""Sweeps after which a proof is given up unless they moved it much less than the ones before."""
 
 NEAR = 64
 """Largest level up to which a few passes from the levels may make a stabilizing policy."""

@@ -106,12 +106,12 @@ def test_what_is_not_left_is_not_lifted(growth):
             assert not (x > b + M @ x).all()
 
 
-def test_what_is_carried_along_is_not_lifted_but_swept():
-    M = transport(400, np.random.default_rng(8))
-    b = np.ones(400)
-    x = b.copy()
-    lifted = leaps.lift(sweeps.System.of(M), b, x)
-    assert not lifted or (x >= (b + M @ x) * (1 - 1e-12)).all()
+def test_what_is_carried_along_is_swept_not_lifted():
+    """No single mode is slow: somewhere the residual grows in 16 steps, though all mass leaves."""
+    M, b = transport(400, np.random.default_rng(8)), np.ones(400)
+    system = sweeps.System.of(M)
+    assert not leaps.lift(system, b, b.copy())
+    assert system.sweep(b, b.copy(), 200)[1] < 1e-14
 
 
 def test_a_policy_is_proved_stabilizing_where_mass_hardly_escapes(monkeypatch):
