@@ -50,8 +50,15 @@ def measure(name: str, repeats: int) -> dict[str, Any]:
     data = data[: len(data) // 16 * 16].view(np.uint64)
     padded = np.append(V, 0.0)
     note("read rows, 1 thread", lambda: _sum(data), "byte", data.nbytes)
-    note("read rows, 2 threads", lambda: _sum_by_two(data), "byte", data.nbytes)
+    halves = np.array_split(data, 2)
+    note("read rows, 2 threads", lambda: _by_two(_sum, halves), "byte", data.nbytes)
     note("read V at random", lambda: _gather(target, padded), "entry", entries)
+    halves_of_targets = np.array_split(target, 2)
+    note(
+        "read V at random, 2 threads",  # two processors may be one core
+        lambda: _by_two(lambda half: _gather(half, padded), halves_of_targets),
+        "entry", entries, "read V at random",
+    )  # fmt: skip
     if isinstance(problem, lm.Problem):
         samples, pilot = _samples(problem), None
         for what, formula in _formulas(problem).items():
@@ -162,9 +169,9 @@ def _on_full_arrays(
     return _median(lambda: formula(full), repeats) * samples / count
 
 
-def _sum_by_two(data: Any) -> int:
+def _by_two(work: Callable[[Any], Any], halves: list[Any]) -> Any:
     with ThreadPoolExecutor(2) as threads:
-        return sum(threads.map(_sum, np.array_split(data, 2)))
+        return sum(threads.map(work, halves))
 
 
 @njit(nogil=True, cache=True)
