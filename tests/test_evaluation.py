@@ -40,6 +40,38 @@ def above(M, b, rng):
     return exact(M, b * rng.uniform(1.0, 3.0, len(b)))
 
 
+@pytest.mark.parametrize("gamma", [0.5, 0.9999, 1.0, 1.01])
+def test_the_rows_of_a_policy_as_a_system(gamma):
+    """The diagonal apart, as 1 / (1 - own); a cell that stays put for ever never ends."""
+    problem = made(
+        {
+            "system": {"kind": "map", "next": {"x": "x + u"}},
+            "state_box": {"x": {"low": -1, "high": 1, "cells": 40}},
+            "attractor": {"points": [{"x": 0}]},
+            "control_grid": {"u": {"low": -0.2, "high": 0.2, "points": 9}},
+            "stage_cost": "1",
+            "sampling": {"kind": "random", "points": 6, "seed": 0},
+            "gamma": gamma,
+        }
+    )
+    lp, rng = lm.compile(problem), np.random.default_rng(9)
+    stays = np.zeros(lp.n, dtype=bool)
+    for _ in range(20):
+        pair = rng.integers(lp.pair_pointer[:-1], lp.pair_pointer[1:])
+        found = lp.rows.system(pair, gamma, lp.directions)
+        expected = gamma * lp.rows.matrix(pair).toarray()
+        own = expected.diagonal().copy()
+        stays |= own == gamma
+        inverse = np.full(lp.n, sweeps.NEVER)
+        inverse[own < 1] = 1 / (1 - own[own < 1])
+        np.testing.assert_allclose(found.inverse, inverse, rtol=1e-12)
+        rest = np.diag(own)
+        for i, (begin, end) in enumerate(zip(found.begin, found.end, strict=True)):
+            rest[i, found.indices[begin:end]] += found.data[begin:end]
+        np.testing.assert_allclose(rest, expected, rtol=1e-15)
+    assert stays.any()
+
+
 @pytest.mark.parametrize("escape", [0.5, 0.02, 1e-3])
 @pytest.mark.parametrize("make", ["mixing", "transport"])
 def test_a_leap_stays_above_its_equation(escape, make):
