@@ -39,6 +39,62 @@ def test_bounds_enclose_the_exact_value(scale, gamma):
                 assert Fraction(below[i]) <= least
 
 
+def rounded_one_way(entries, direction):
+    """Return a model whose first cell leads to many, and values whose sum rounds up (1), down (-1).
+
+    Each value is the one of a few whose addition errs most.
+    """
+    cells = [[(dict.fromkeys(range(1, entries + 1), 1), 0.0)]]
+    cells += [[({-1: entries}, 2.0)] for _ in range(entries)]
+    lp = mdp(cells, entries, 1.0)
+    values, q = summands(entries, float(lp.rows.shares.value[0]), direction)
+    return lp, np.append(1.0, values), q
+
+
+def summands(count, factor, direction):
+    """Return values of which the sum, each times a factor, rounds one way, and that sum."""
+    rng, q, values = np.random.default_rng(count), 0.0, np.ones(count)
+    for j in range(count):
+        some = rng.uniform(1.0, 2.0, 32)
+        terms = factor * some
+        error = (q + terms) - (np.longdouble(q) + terms.astype(np.longdouble))
+        best = int(np.argmax(direction * error))
+        values[j], q = some[best], q + terms[best]
+    return values, q
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_bounds_hold_where_every_rounding_errs_the_same_way(direction):
+    lp, V, q = rounded_one_way(400, direction)
+    exact = exact_backup(lp, 0, V, 1.0, None)
+    assert direction * (Fraction(q) - exact) > 100 * Fraction(2) ** -53 * exact
+    assert Fraction(bounds.expected_above(lp, lp.pair_pointer[:-1], V, 1.0)[0]) >= exact
+    assert Fraction(bounds.backup_below(lp, V, 1.0, None)[0]) <= exact
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_inflow_of_many_cells_errs_no_more_than_it_says(direction):
+    """All mass but the first cell's flows into the first, each addition off the same way."""
+    mu, q = summands(400, 1.0, direction)
+    lp = mdp([[({-1: 1}, 1.0)], *([[({0: 1}, 1.0)]] * 400)], 1, 1.0)
+    total, relative, absolute = bounds.inflow(lp, lp.pair_pointer[:-1], np.append(1.0, mu), 1.0)
+    error = Fraction(float(total[0])) - sum(Fraction(float(x)) for x in mu)
+    assert float(total[0]) == q
+    assert direction * error > 100 * Fraction(2) ** -53 * Fraction(q)
+    assert abs(error) <= Fraction(relative[0]) * Fraction(q) + Fraction(float(absolute[0]))
+
+
+def test_long_rows_are_not_taken_for_clear():
+    """The sum of so many terms is off by more than the margin of the quick look."""
+    lp, W, q = rounded_one_way(30_000, 1)
+    exact = exact_backup(lp, 0, W, 1.0, lp.cost)
+    W[0] = q * bounds.CLEAR * (1 - 1e-15)
+    assert Fraction(W[0]) > exact
+    assert not bounds.holds_for_all(lp, W, 1.0, lp.cost)
+    W[0] = float(exact) * (1 - 1e-15)
+    assert bounds.holds_for_all(lp, W, 1.0, lp.cost)
+
+
 def test_decrease_is_rounded_down():
     for seed in range(100):
         rng = np.random.default_rng(seed)
