@@ -6,7 +6,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from models import mdp, random_lp
+from models import dense, mdp, random_lp
 from problems import made, steps
 
 import lmdsl as lm
@@ -93,6 +93,24 @@ def test_long_rows_are_not_taken_for_clear():
     assert not bounds.holds_for_all(lp, W, 1.0, lp.cost)
     W[0] = float(exact) * (1 - 1e-15)
     assert bounds.holds_for_all(lp, W, 1.0, lp.cost)
+
+
+@pytest.mark.parametrize("zero", [0.0, 0.3])
+def test_the_worst_excess_by_hand(zero):
+    seen = set()
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        lp = random_lp(rng, 12, gamma=1.1, samples=7, zero=zero)
+        if not lp.n:
+            continue
+        V = rng.random(lp.n) * 10.0 ** rng.integers(-2, 4, lp.n)
+        r = V[lp.cell] - (lp.gamma * (dense(lp) @ V) + lp.cost)
+        worst, stuck = bounds.worst_excess(lp, V)
+        paid = lp.cost > 0
+        assert worst == pytest.approx((np.maximum(r, 0)[paid] / lp.cost[paid]).max(initial=0.0))
+        assert stuck == bool((r[~paid] > 0).any())
+        seen.add(stuck)
+    assert seen == ({False, True} if zero else {False})
 
 
 def test_decrease_is_rounded_down():

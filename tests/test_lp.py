@@ -11,6 +11,7 @@ from models import dense, random_lp
 from problems import made, standard_map, steps
 
 import lmdsl as lm
+from lmdsl import graph
 from lmdsl.graph import CellStatus, stabilizable, tree
 from lmdsl.rows import Shares
 from lmdsl.sampling import Nodes
@@ -167,6 +168,30 @@ def test_stabilizable_set_by_definition(seed):
         survives = found.inside[i] and all(j == cells or found.inside[j] for j in s)
         assert found.surviving[k] == survives
     del build
+
+
+@pytest.mark.parametrize("patience", [0, 0.5, 8])
+def test_levels_by_sweeps_and_by_search_are_the_same(patience, monkeypatch):
+    """By definition: one more than the least level entered, by the first pair that enters it."""
+    monkeypatch.setattr(graph, "PATIENCE", patience)
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        lp = random_lp(rng, 30, controls=5, absorb=0.05)
+        P = dense(lp) > 0
+        spans = itertools.pairwise(lp.rows.pointer)
+        absorbed = np.array([lp.n in lp.rows.target[a:b] for a, b in spans])
+        level = np.full(lp.n, -1)
+        first = np.full(lp.n, -1)
+        enters, below = absorbed, 0
+        while enters.any():
+            for k in np.flatnonzero(enters)[::-1]:
+                if level[lp.cell[k]] in (-1, below + 1):
+                    level[lp.cell[k]], first[lp.cell[k]] = below + 1, k
+            below += 1
+            enters = P[:, level == below].any(axis=1) & (level[lp.cell] == -1)
+        found = tree(lp.pair_pointer, lp.rows)
+        np.testing.assert_array_equal(found[0], level)
+        np.testing.assert_array_equal(found[1], first)
 
 
 def test_tree_levels_are_distances():
