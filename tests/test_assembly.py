@@ -10,7 +10,7 @@ import pytest
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import merging, sampler, threads
+from lmdsl import merging, partition, sampler, threads
 from lmdsl.merging import mean_cost, merge, tile
 from lmdsl.partition import EDGE, Partition
 
@@ -199,3 +199,13 @@ def test_results_come_in_order_and_the_first_error_ends_them(monkeypatch, count)
     with pytest.raises(ValueError, match="20"):
         seen.extend(threads.in_order(work, range(10**9)))
     assert seen == list(range(20))
+
+
+def test_circles_of_every_number_of_cells():
+    """49 (1 / 49) < 1 in doubles: the first cell of the next turn must not become cell 49."""
+    assert any(m * (1 / m) < 1 for m in range(1, 400))
+    for cells in range(1, 400):
+        k = np.concatenate([np.arange(-3 * cells, 3 * cells), cells * 10.0 ** np.arange(2, 13)])
+        index = np.zeros(len(k))
+        partition.circle(k + 0.5, 0.0, 1.0, float(cells), 1.0, index)
+        np.testing.assert_array_equal(index, k % cells)
