@@ -1,6 +1,12 @@
 """Shared by all tests."""
 
+import signal
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+# A shell starts what runs in its background with Ctrl-C ignored, and so would the commands that
+# tests interrupt; a handler is not inherited.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
