@@ -146,7 +146,11 @@ def _text(data: Any) -> bytes:
 
 def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{k: np.ascontiguousarray(v) for k, v in arrays.items()})
+    with zipfile.ZipFile(buffer, "w") as archive:  # as np.savez, which may pickle before NumPy 2.2
+        for name, array in arrays.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content.getbuffer())
     return buffer.getvalue()
 
 

@@ -6,12 +6,12 @@ import ast
 import functools
 import math
 import pickle
-import time
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from spent import at_most
 
 from lmdsl import formulas
 from lmdsl.errors import BadInput
@@ -380,10 +380,9 @@ def test_depth_is_counted_in_nesting_and_not_in_what_stands_beside():
 
 
 @pytest.mark.parametrize("hostile", ["(", "-", "sin(", "x**", "where(", "((-", "x<", "1+("])
-def test_the_deepest_text_that_fits_is_refused_and_quickly(hostile):
-    begin = time.perf_counter()
-    refused((hostile * 4000)[:4000])
-    assert time.perf_counter() - begin < 1
+def test_the_deepest_text_that_fits_is_refused_and_cheaply(hostile):
+    with at_most(10):
+        refused((hostile * 4000)[:4000])
 
 
 @pytest.mark.parametrize("operator", ["+", "-", "*", "/"])
@@ -598,10 +597,9 @@ def test_a_no_op_formula_list_is_fine():
     assert Program([])({}) == ()
 
 
-def test_a_large_program_compiles_and_runs_in_bounded_time():
+def test_a_large_program_compiles_and_runs_in_bounded_work():
     text = "+".join(f"sin({k}*x)" for k in range(199))  # 995 nodes
-    begin = time.perf_counter()
-    compiled = Program([parse(text, NAMES)] * 20)
-    assert len(compiled.operations) == 199 * 2 + 198
-    compiled({"x": np.ones(10)})
-    assert time.perf_counter() - begin < 2
+    with at_most(20):
+        compiled = Program([parse(text, NAMES)] * 20)
+        assert len(compiled.operations) == 199 * 2 + 198
+        compiled({"x": np.ones(10)})

