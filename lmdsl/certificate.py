@@ -8,7 +8,7 @@ stored doubles that holds in exact arithmetic (see bounds.py):
 2. upper bound   V_up >= gamma P_u V_up + G_u, V_up >= 0: the policy costs at most m'V_up.
 3. lower bound   W <= gamma P_a W + G_a for every surviving pair: no policy that stays in C u A and
                  has finite weighted occupation costs less than m'W.
-4. measure       mu >= 0, ||m - mu + gamma P_u'mu||_1 <= 1e-9: the Lyapunov measure.
+4. measure       mu >= 0, ||m - mu + gamma P_u'mu||_1 <= 1e-9 max(1, ||mu||_1): Lyapunov measure.
 5. gap           m'(V_up - W) / m'V_up.
 6. refusal       w >= 0, w != 0, w <= gamma P_a w for every surviving pair: the cells with w > 0
                  have no policy of finite occupation at this gamma.
@@ -136,29 +136,37 @@ def check_lower(lp: StabilizationLP, W: Floats) -> bool:
     return bounds.holds_for_all(lp, W, lp.gamma, lp.cost)
 
 
-def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> float:
-    """Claim 4: return ||m - mu + gamma P_u'mu||_1 rounded up; infinite where mu is not >= 0.
+def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> tuple[float, bool]:
+    """Claim 4: return ||m - mu + gamma P_u'mu||_1 rounded up, and whether the claim holds.
 
-    Where the rounding of a large measure alone exceeds the tolerance, small models are summed
-    exactly.
+    The residual is infinite where mu is not >= 0. Where rounding alone decides, or a number
+    overflows, small models are summed exactly.
     """
     if mu.shape != (lp.n,) or not (np.isfinite(mu).all() and (mu >= 0).all()):
-        return math.inf
+        return math.inf, False
     with np.errstate(over="ignore", invalid="ignore"):
         inflow, relative, absolute = bounds.inflow(lp, pair, mu, lp.gamma)
         rounding = relative * (lp.weight + mu + inflow) + absolute
         residual = np.abs((lp.weight - mu) + inflow)
-    if not np.isfinite(residual).all():
-        return math.inf
-    bound = bounds.total_above(residual + rounding)
-    hopeful = bound - 2 * bounds.total_above(rounding) <= MEASURE_TOLERANCE < bound
+        size = float(mu.sum()) * (1 - 70 * bounds.UNIT)
+    finite = math.isfinite(size) and bool(np.isfinite(residual).all())
+    allowed = MEASURE_TOLERANCE * max(1.0, size) * (1 - 4 * bounds.UNIT)
+    bound = bounds.total_above(residual + rounding) if finite else math.inf
+    if bound <= allowed < math.inf:
+        return bound, True
+    hopeful = not finite or bound - 2 * bounds.total_above(rounding) <= allowed
     entries = lp.rows.pointer[pair + 1] - lp.rows.pointer[pair]
     if hopeful and entries.sum() <= bounds.MAX_EXACT:
         policy_rows = (row for _, row in rational.rows(lp, pair))
-        return rational.rounded_up(
-            rational.residual(lp, policy_rows, [*map(Fraction, mu.tolist())])
-        )
-    return bound
+        exactly = [*map(Fraction, mu.tolist())]
+        found = rational.residual(lp, policy_rows, exactly)
+        return rational.rounded_up(found), found <= allowed_residual(exactly)
+    return bound, False
+
+
+def allowed_residual(mu: list[Fraction]) -> Fraction:
+    """Return the largest residual of claim 4 for a measure, exactly."""
+    return Fraction(MEASURE_TOLERANCE) * max(Fraction(1), sum(mu, Fraction(0)))
 
 
 def check_refusal(lp: StabilizationLP, w: Floats) -> bool:
@@ -184,7 +192,8 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
     V_up, W, mu, w = witness.V_up, witness.W, witness.mu, witness.w
     if pair is not None and not is_policy(lp, pair):
         pair = None
-    contraction = residual = cost = floor = None
+    contraction = cost = floor = None
+    residual: tuple[float, bool] | None = None
     upper = False
     if pair is not None:
         under, own = lp.under(pair), np.arange(lp.n)
@@ -193,7 +202,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
             proved = None if w is None else check_stabilizing(under, own, w)
             return proved, V_up is not None and check_upper(under, own, V_up)
 
-        def of_measure() -> float | None:
+        def of_measure() -> tuple[float, bool] | None:
             return None if mu is None else check_measure(under, own, mu)
 
         claims, residual = threads.both(of_policy, of_measure, lp.n >= MANY)
@@ -207,13 +216,13 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
         stabilizing=contraction is not None,
         upper_bound=upper,
         lower_bound=lower,
-        measure=residual is not None and residual <= MEASURE_TOLERANCE,
+        measure=residual is not None and residual[1],
         refusal=pair is None and w is not None and check_refusal(lp, w),
         contraction=contraction,
         cost=cost,
         lower=floor,
         gap=gap(lp, V_up, W) if upper and lower else None,
-        measure_residual=residual,
+        measure_residual=None if residual is None else residual[0],
         tolerance=tolerance,
     )
     return explained(lp, pair, certificate)
@@ -252,8 +261,8 @@ def explained(lp: StabilizationLP, pair: Pairs | None, certificate: Certificate)
                 + (
                     ""
                     if shown is None
-                    else f": its residual is {shown:.2g}, above 1e-9, the numbers no longer "
-                    "allow it; lower gamma"
+                    else f": its residual is {shown:.2g}, above 1e-9 of its size; the numbers "
+                    "no longer allow it, lower gamma"
                 )
             )
         width = certificate.gap

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from lmdsl import rational
 from lmdsl.certificate import (
-    MEASURE_TOLERANCE,
     Certificate,
     Witness,
+    allowed_residual,
     explained,
     is_policy,
 )
@@ -51,7 +51,7 @@ def check_exactly(lp: StabilizationLP, witness: Witness, tolerance: float) -> Ce
         stabilizing=contraction is not None and contraction < 1,
         upper_bound=cost is not None,
         lower_bound=floor is not None,
-        measure=residual is not None and residual <= Fraction(MEASURE_TOLERANCE),
+        measure=residual is not None and mu is not None and residual <= allowed_residual(mu),
         refusal=pair is None and w is not None and any(w) and _below_all(lp, w, None),
         contraction=None if contraction is None or contraction >= 1 else rounded_up(contraction),
         cost=None if cost is None else rounded_up(cost),

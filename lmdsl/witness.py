@@ -196,9 +196,9 @@ def _measure_vector(under: StabilizationLP, rows: Peeled) -> Floats | None:
     def matrix() -> Any:
         return under.gamma * under.rows.matrix()
 
-    # The residual counts in absolute terms, summed over all cells.
+    # The residual counts in absolute terms where mu is small, summed over all cells.
     flat = 1e-2 * MEASURE_TOLERANCE / under.n
     mu = linear.solve_transposed(rows, under.weight, matrix, flat=flat)
-    if mu is not None and check_measure(under, np.arange(under.n), mu) > MEASURE_TOLERANCE:
+    if mu is not None and not check_measure(under, np.arange(under.n), mu)[1]:
         mu = linear.solve_transposed(rows, under.weight, matrix, start=mu)
     return mu

@@ -16,7 +16,9 @@ from problems import doubling, made, standard_map, steps
 from random_problems import random_problem
 
 import lmdsl as lm
+from lmdsl.certificate import Witness, check
 from lmdsl.cli import main
+from lmdsl.exact import check_exactly
 from lmdsl.exports import export_certificate, export_drn
 
 SCRIPT = Path(__file__).parents[1] / "tools/check_certificate.py"
@@ -91,6 +93,30 @@ def test_good_certificates_pass(problem, tmp_path):
     assert status == 0, said
     assert said.count("holds") == 5
     assert "FAILS" not in said
+
+
+def test_a_large_measure_counts_relative_to_its_size(tmp_path):
+    # Just below gamma_bar = 10/3 mu sums to 6e7; doubles cannot hold its residual below 1e-9.
+    result = lm.solve(made(standard_map(20, gamma=10 / 3 * (1 - 1e-5))))
+    assert result.status == "verified", result.message
+    size = result.measure.sum()
+    assert size > 1e7
+    assert result.certificate.measure_residual > 1e-9
+    result.save(tmp_path / "out")
+    assert lm.verify(tmp_path / "out").holds
+    assert lm.verify(tmp_path / "out", exact=True).holds
+    assert checked(exported(result, tmp_path))[0] == 0
+    for off, holds in ((2e-10, True), (2e-9, False)):
+        measure = result.measure.copy()
+        measure[np.flatnonzero(result.cell_status == 1)[-1]] += off * size
+        spoiled = replace(result, measure=measure)
+        on = result.lp.cells
+        pair = np.array([result.lp.column(c, result.control_index[c]) for c in on])
+        witness = Witness(pair, mu=measure[on])
+        for judge in (check, check_exactly):
+            assert judge(result.lp, witness, 1e-6).measure == holds
+        said = checked(exported(spoiled, tmp_path))[1]
+        assert ("claim 4 measure: holds" in said) == holds, said
 
 
 def test_verdicts_agree_on_random_problems(tmp_path):

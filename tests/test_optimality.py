@@ -73,9 +73,7 @@ def test_near_the_limit_no_false_yes_and_no_silence(seed):
             continue
         result = lm.solve(replace(lp, gamma=gamma))
         if factor < 1 - 1e-5:
-            # A measure of 1e6 and more cannot be stored with a residual of 1e-9.
-            huge = result.measure.max() > 1e5 and not result.certificate.measure
-            assert result.status == "verified" or huge, (factor, result.message)
+            assert result.status == "verified", (factor, result.message)
             assert result.certificate.stabilizing
             assert result.gap <= 1e-6
         elif factor < 1:
