@@ -39,3 +39,19 @@ def shown(value: object, limit: int = 60) -> str:
         value = value[:limit] + "..."
     text = ascii(value)
     return text if len(text) <= 2 * limit else text[: 2 * limit] + "..."
+
+
+def plain_text(value: object, limit: int = 200) -> str:
+    """Return what somebody else's object says of itself: one printable line, whatever it does.
+
+    An object that cannot say anything is named by its class.
+    """
+    try:
+        text = str(value)[: 2 * limit]
+        text = str.encode(text, "utf-8", "backslashreplace").decode()  # no class of its own
+    except (KeyboardInterrupt, MemoryError):
+        raise
+    except BaseException:
+        text = f"an unprintable {type.__dict__['__name__'].__get__(type(value))}"
+    text = " ".join(text.split())
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)[:limit]

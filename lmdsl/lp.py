@@ -21,20 +21,21 @@ from lmdsl import graph
 from lmdsl.directions import Directions
 from lmdsl.errors import BadInput
 from lmdsl.files import write_whole
+from lmdsl.frozen import Frozen, freeze
 from lmdsl.graph import CellStatus, Predecessors
 from lmdsl.local import LocalController
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.regions import Regions
-from lmdsl.rows import Rows, freeze
+from lmdsl.rows import Rows
 from lmdsl.sampling import control_vectors
 from lmdsl.transitions import Progress, assemble
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class StabilizationLP:
+@dataclass(frozen=True, eq=False)
+class StabilizationLP(Frozen):
     """The finite model of a problem on its stabilizable set, and its linear program.
 
     Attributes
@@ -78,10 +79,6 @@ class StabilizationLP:
     cost: Floats
     gamma: float
     weight: Floats
-
-    def __post_init__(self) -> None:
-        freeze(self.controls, self.cell_status, self.cells, self.pair_pointer, self.control)
-        freeze(self.cost, self.weight)
 
     @property
     def n(self) -> int:

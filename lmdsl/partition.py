@@ -19,6 +19,7 @@ from numba import njit, types
 from numpy.typing import NDArray
 
 from lmdsl.errors import BadInput
+from lmdsl.frozen import Frozen
 from lmdsl.problem import Problem
 
 EDGE = 1e-9
@@ -31,8 +32,8 @@ Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class Partition:
+@dataclass(frozen=True, eq=False)
+class Partition(Frozen):
     """A product grid of cells over the state box.
 
     Attributes

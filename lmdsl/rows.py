@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from lmdsl import threads
 from lmdsl.directions import Directions
+from lmdsl.frozen import Frozen
 from lmdsl.sampling import Nodes
 from lmdsl.sweeps import NEVER, ONE, System
 
@@ -29,8 +30,8 @@ PARTS, MANY = 8, 10_000
 """Ranges into which rows are split for threads, and how many rows are worth it."""
 
 
-@dataclass(frozen=True)
-class Shares:
+@dataclass(frozen=True, eq=False)
+class Shares(Frozen):
     """What the codes of a set of rows stand for.
 
     Attributes
@@ -49,9 +50,6 @@ class Shares:
     total: int
     value: NDArray[np.float64]
     merged: bool = False
-
-    def __post_init__(self) -> None:
-        freeze(self.value)
 
     @classmethod
     def of(cls, points: int, nodes: Nodes) -> Shares:
@@ -74,8 +72,8 @@ class Shares:
         )
 
 
-@dataclass(frozen=True)
-class Rows:
+@dataclass(frozen=True, eq=False)
+class Rows(Frozen):
     """Transition rows in compressed form.
 
     Attributes
@@ -97,9 +95,6 @@ class Rows:
     code: NDArray[np.unsignedinteger]
     shares: Shares
     columns: int
-
-    def __post_init__(self) -> None:
-        freeze(self.pointer, self.target, self.code)
 
     @property
     def count(self) -> int:
@@ -310,12 +305,6 @@ def _gather(rows, pointer, target, code, share, columns, indptr, indices, data):
                 used += ONE
         indptr[r + ONE] = used
     return used
-
-
-def freeze(*arrays: NDArray[Any]) -> None:
-    """Make arrays read-only: a certificate must be about the model that was compiled."""
-    for array in arrays:
-        array.setflags(write=False)
 
 
 def code_type(codes: int) -> type[np.unsignedinteger]:

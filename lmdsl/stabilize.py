@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import backends, bellman, certificate, elimination, feasibility, gamma, policy
+from lmdsl import backends, bellman, certificate, feasibility, gamma, policy
+from lmdsl.asking import ask
 from lmdsl.backends import Backend, Options, Solution, Stop
-from lmdsl.backends.scaled import failure
 from lmdsl.certificate import Certificate, Verified, Witness
 from lmdsl.errors import BadInput, shown
 from lmdsl.graph import CellStatus
@@ -120,6 +119,7 @@ def solve(
         proof=first.w if isinstance(first, feasibility.Feasible) else None,
         progress=progress,
     )
+    iteration = None
     if isinstance(first, feasibility.Undecided):
         word = "time limit" if late() else "undecided"
         stop = Stop.TIME_LIMIT if late() else Stop.FAILED
@@ -127,9 +127,9 @@ def solve(
     else:
         if progress:
             progress("solve", -1.0)
-        solution = _asked(lp, chosen, options)
-    outcome = _polish(lp, solution, first.pair, tolerance, late)
-    solution = replace(solution, details={})  # the rows of its last policy would stay till the end
+        solution, iteration = ask(lp, chosen, options)
+    outcome = _polish(lp, solution, iteration, first.pair, tolerance, late)
+    iteration = None  # the rows of its last policy would stay till the end
     job.solve_seconds = time.perf_counter() - started
     if progress:
         progress("verify", -1.0)
@@ -189,66 +189,6 @@ class _Outcome:
     gap_before: float | None
 
 
-def _asked(lp: StabilizationLP, backend: Backend, options: Options) -> Solution:
-    """Ask a backend; whatever it raises or returns, a well-formed solution comes out."""
-    asked, kept = lp, None
-    try:
-        if backend.capabilities.elimination and options.start is not None:
-            kept, options = _without_suboptimal(lp, options)
-            asked = lp if len(kept) == lp.K else lp.part(kept, np.arange(lp.n))
-        solution = backend.solve(asked, options)
-    except BadInput:
-        raise
-    except BaseException as error:  # solvers written in Rust panic outside Exception
-        return failure(error)
-    if not isinstance(solution, Solution) or not isinstance(solution.stop, Stop):
-        return Solution(Stop.FAILED, "the backend returned no Solution")
-    occupation, pair = _vector(solution.occupation, asked.K), _policy(asked, solution.pair)
-    if kept is not None:
-        pair = None if pair is None else kept[pair]
-        if occupation is not None:
-            spread = np.zeros(lp.K)
-            spread[kept] = occupation
-            occupation = spread
-    return replace(
-        solution,
-        word=str(solution.word)[:200],
-        value=_vector(solution.value, lp.n),
-        occupation=occupation,
-        pair=pair,
-    )
-
-
-def _without_suboptimal(lp: StabilizationLP, options: Options) -> tuple[Pairs, Options]:
-    """Return the columns worth solving for, and the options for a model of these alone."""
-    started, limit, start = time.monotonic(), options.time_limit, options.start
-    assert start is not None
-
-    def late() -> bool:
-        return limit is not None and time.monotonic() - started > limit
-
-    kept = elimination.survivors(lp, start, options.proof, late)
-    left = None if limit is None else max(limit - (time.monotonic() - started), 1e-9)
-    return kept, replace(options, time_limit=left, start=np.searchsorted(kept, start))
-
-
-def _vector(values: Any, count: int) -> Any:
-    """Return values as finite doubles of the right length, else None."""
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        return None
-    return array if array.shape == (count,) and np.isfinite(array).all() else None
-
-
-def _policy(lp: StabilizationLP, pair: Any) -> Pairs | None:
-    """Return a policy as an array of columns, one of each cell's own, else None."""
-    if not isinstance(pair, np.ndarray) or pair.shape != (lp.n,) or pair.dtype.kind not in "iu":
-        return None
-    own = (pair >= lp.pair_pointer[:-1]) & (pair < lp.pair_pointer[1:])
-    return pair.astype(np.int64) if own.all() else None
-
-
 def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
     """Return the policy of a solution: its own, else greedy in V, else largest occupation."""
     if solution.pair is not None:
@@ -263,19 +203,20 @@ def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
 
 
 def _polish(
-    lp: StabilizationLP, solution: Solution, start: Pairs, tolerance: float, stop: policy.Stop
+    lp: StabilizationLP,
+    solution: Solution,
+    iteration: policy.Iteration | None,
+    start: Pairs,
+    tolerance: float,
+    stop: policy.Stop,
 ) -> _Outcome:
     """Improve a backend's policy exactly until nothing is strictly better, then break ties.
 
     A policy that is not g-stabilizing is discarded where gamma >= 1. After a limit the policy is
     left as it is: a limit is not a license to go on.
     """
-    details = solution.details if isinstance(solution.details, Mapping) else {}
-    done = details.get("iteration")
-    if solution.stop.success and isinstance(
-        done, policy.Iteration
-    ):  # our own: it ends exactly where polishing would begin
-        return _tidied(lp, done, tolerance, 0, None)
+    if iteration is not None and solution.stop.success:  # it ends where polishing would begin
+        return _tidied(lp, iteration, tolerance, 0, None)
     pair = _claimed(lp, solution)
     if pair is not None and not _usable(lp, pair, solution.value):
         pair = None

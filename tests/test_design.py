@@ -16,7 +16,7 @@ PACKAGE = Path(lm.__file__).parent
 
 # Data flows one way: a module imports only from modules on an earlier line.
 ORDER = """
-errors
+errors frozen
 files staging
 formulas
 intervals
@@ -50,7 +50,7 @@ backends.base
 backends.scaled
 backends
 backends.*
-certificate
+asking certificate
 witness
 exact
 controller

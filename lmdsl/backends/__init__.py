@@ -5,12 +5,14 @@ An entry point names a :class:`Backend`. Nothing is imported before it is asked 
 
 from __future__ import annotations
 
+import sys
+from dataclasses import fields
 from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
 from importlib.util import find_spec
 
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
-from lmdsl.errors import BadInput, MissingDependency, shown
+from lmdsl.errors import BadInput, MissingDependency, plain_text, shown
 
 BUILT_IN = {
     "policy-iteration": "lmdsl.backends.policy_iteration",
@@ -19,6 +21,7 @@ BUILT_IN = {
     "cvxpy": "lmdsl.backends.cvxpy",
 }
 DEFAULT = "policy-iteration"
+FLAGS = [field.name for field in fields(Capabilities) if isinstance(field.default, bool)]
 
 __all__ = [
     "Backend",
@@ -44,25 +47,56 @@ def get(name: str) -> Backend:
     Raises
     ------
     BadInput
-        There is no such backend.
+        There is no such backend, or what a package offers by this name is broken.
     MissingDependency
         A package it needs is not installed.
     """
     if name in BUILT_IN:
         backend: Backend = import_module(BUILT_IN[name]).BACKEND
-    elif name in _third_party():
-        loaded = _third_party()[name].load()
-        if not isinstance(loaded, Backend):
-            raise BadInput(f"the entry point {name!r} is no lmdsl.backends.Backend", "backend")
-        backend = loaded
+    elif name in (offered := _third_party()):
+        backend = _loaded(name, offered[name])
     else:
         raise BadInput(
-            f"{shown(name)} is not a backend; the backends are {', '.join(names())}", "backend"
+            f"{shown(name)} is not a backend; the backends are {', '.join(map(_said, names()))}",
+            "backend",
         )
     for package in backend.requires:
-        if find_spec(package) is None:
+        if not _found(package):
             raise MissingDependency(f"{name} needs the package {package}; install it", "backend")
     return backend
+
+
+def ours(backend: Backend) -> bool:
+    """Return whether a backend's function is one of ours."""
+    modules = (sys.modules.get(name) for name in BUILT_IN.values())
+    return any(module is not None and backend.solve is module.BACKEND.solve for module in modules)
+
+
+def plain(backend: Backend) -> Backend:
+    """Return a backend whose record is what it should be, in types of our own.
+
+    Raises
+    ------
+    BadInput
+        It is not.
+    """
+    try:
+        record = backend.capabilities
+        flags = {name: bool(getattr(record, name)) for name in FLAGS}
+        capabilities = Capabilities(
+            algorithms=tuple(map(_word, record.algorithms)),
+            extras={_word(key): _word(value) for key, value in dict(record.extras).items()},
+            **flags,
+        )
+        requires = tuple(map(_word, backend.requires))
+        found = Backend(_word(backend.name), backend.solve, capabilities, requires)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        raise BadInput(f"its record is broken: {plain_text(error)}", "backend") from None
+    if not callable(found.solve):
+        raise BadInput("its record is broken: solve is no function", "backend")
+    return found
 
 
 def missing(backend: Backend) -> dict[str, str]:
@@ -74,7 +108,7 @@ def missing(backend: Backend) -> dict[str, str]:
     for algorithm, distribution in backend.capabilities.extras.items():
         try:
             version(distribution)
-        except PackageNotFoundError:
+        except (PackageNotFoundError, ValueError):
             found[algorithm] = distribution
     return found
 
@@ -85,10 +119,12 @@ def resolve(spec: str | Backend) -> tuple[Backend, str | None]:
     Raises
     ------
     BadInput
-        There is no such backend or algorithm.
+        There is no such backend or algorithm, or its record is broken.
     """
     if isinstance(spec, Backend):
-        return spec, None
+        return plain(spec), None
+    if not isinstance(spec, str):
+        raise BadInput(f"{shown(spec)} is neither the name of a backend nor a Backend", "backend")
     name, _, algorithm = spec.partition(":")
     backend = get(name)
     known = backend.capabilities.algorithms
@@ -100,5 +136,60 @@ def resolve(spec: str | Backend) -> tuple[Backend, str | None]:
     return backend, algorithm or None
 
 
-def _third_party() -> dict[str, EntryPoint]:
-    return {entry.name: entry for entry in entry_points(group="lmdsl.backends")}
+def _third_party() -> dict[str, list[EntryPoint]]:
+    """Return what installed packages offer, by name; the same name twice is two entries."""
+    found: dict[str, list[EntryPoint]] = {}
+    for entry in entry_points(group="lmdsl.backends"):
+        others = found.setdefault(str(entry.name), [])
+        if all(entry.value != other.value for other in others):  # else one package, seen twice
+            others.append(entry)
+    return found
+
+
+def _loaded(name: str, entries: list[EntryPoint]) -> Backend:
+    """Return the backend that an entry point names; whatever it raises is said as bad input."""
+    by = " and ".join(_package(entry) for entry in entries)
+    if not name.isprintable() or any(c in name for c in " :,"):
+        raise BadInput(f"{by} offers the name {shown(name)}, which is no name", "backend")
+    if len(entries) > 1:
+        raise BadInput(f"{shown(name)} is offered by {by}; uninstall all but one", "backend")
+    try:
+        found = entries[0].load()
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        said = plain_text(f"{type(error).__name__}: {plain_text(error)}")
+        raise BadInput(
+            f"{by} offers {shown(name)}, which does not load: {said}", "backend"
+        ) from None
+    if not isinstance(found, Backend):
+        raise BadInput(f"{by} offers {shown(name)}, which is no lmdsl.backends.Backend", "backend")
+    try:
+        return plain(found)
+    except BadInput as error:
+        raise BadInput(f"{by} offers {shown(name)}; {error.message}", "backend") from None
+
+
+def _package(entry: EntryPoint) -> str:
+    """Return the name of the distribution that declares an entry point."""
+    try:
+        return plain_text(entry.dist.name)  # type: ignore[union-attr]
+    except Exception:  # its metadata has none
+        return "an unnamed package"
+
+
+def _said(name: str) -> str:
+    return name if name.isprintable() else shown(name)
+
+
+def _word(value: object) -> str:
+    if not isinstance(value, str) or not value.isprintable():
+        raise TypeError(f"{shown(value)} is no name")
+    return str(value)
+
+
+def _found(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except (ImportError, ValueError):  # a package inside one that is missing
+        return False

@@ -7,15 +7,18 @@ Back: V = max G * y with y the multiplier of A x = b, and theta = max m * x.
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from traceback import walk_tb
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.backends.base import Solution, Stop
+from lmdsl.errors import plain_text
 from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
@@ -92,14 +95,22 @@ class ScaledLP:
 
 
 def failure(error: BaseException) -> Solution:
-    """Return the solution that stands for a solver's exception; Ctrl-C and exit go through.
+    """Return the solution that stands for a solver's exception.
 
-    Panics of solvers written in Rust derive from BaseException alone.
+    Only Ctrl-C, and what a signal handler of the program raises, goes through. Panics of solvers
+    written in Rust derive from BaseException alone, and a solver that exits must not end the
+    program that asked it.
     """
-    if isinstance(error, KeyboardInterrupt | SystemExit | GeneratorExit):
+    if isinstance(error, KeyboardInterrupt) or _by_signal(error):
         raise error
-    text = " ".join(str(error).split())
-    return Solution(Stop.FAILED, f"{type(error).__name__}: {text}"[:200])
+    return Solution(Stop.FAILED, plain_text(f"{type(error).__name__}: {plain_text(error)}"))
+
+
+def _by_signal(error: BaseException) -> bool:
+    """Return whether an exception comes out of a Python function that handles a signal."""
+    handlers = [signal.getsignal(number) for number in signal.valid_signals()]
+    codes = {getattr(handler, "__code__", None) for handler in handlers}
+    return any(frame.f_code in codes for frame, _ in walk_tb(error.__traceback__))
 
 
 def _unit(values: Floats) -> float:

@@ -76,6 +76,7 @@ def _backends(parsed: Arguments) -> int:
     if parsed.json:
         print_json(listed, indent=2)
         return 0
+    listed = {safe(name): entry for name, entry in listed.items()}
     width = max(map(len, listed))
     for name, entry in listed.items():
         if entry["available"]:

@@ -54,7 +54,7 @@ class Known:
         return float(lp.solve_weight @ self.value)
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Weighted(StabilizationLP):
     """The same model, to be solved with another weight.
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.backends import Backend, Options, Solution, Stop
+from lmdsl.backends.scaled import failure
 from lmdsl.errors import LmdslError, MissingDependency
 from lmdsl.lp import StabilizationLP
 from lmdsl.testing.known import Known
@@ -79,11 +80,10 @@ class Probe:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 return self.backend.solve(lp, Options(algorithm=self.algorithm, **options))
-        except (LmdslError, KeyboardInterrupt, SystemExit, GeneratorExit):
+        except LmdslError:
             raise
         except BaseException as error:  # solvers written in Rust panic outside Exception
-            text = " ".join(str(error).split())[:200]
-            self.malformed.append(f"it raises {type(error).__name__}: {text}")
+            self.malformed.append(f"it raises {failure(error).word}")
             raise Unjudged("the backend raised an exception") from error
 
     def solved(self, known: Known, **options: Any) -> tuple[StabilizationLP, Solution]:
@@ -134,6 +134,8 @@ def misshapen(lp: StabilizationLP, found: Any) -> str | None:
         if array is None:
             continue
         given += 1
+        if isinstance(array, np.ndarray) and type(array) is not np.ndarray:
+            return f"{name} is a {type(array).__name__}, not a plain array"
         if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
             return f"{name} is no array of the right kind of numbers"
         if array.shape != (count,):

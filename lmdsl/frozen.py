@@ -1,0 +1,73 @@
+"""Records that hold arrays: what they hold is never written to, and two of them can be compared."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def freeze(*arrays: NDArray[Any]) -> None:
+    """Make arrays read-only: no caller, and no backend, may change what others hold."""
+    for array in arrays:
+        array.setflags(write=False)
+
+
+class Frozen:
+    """Base of frozen dataclasses (``eq=False``) that hold arrays.
+
+    Arrays become read-only when a record is made, copied or unpickled. Records are equal when of
+    the same class with equal fields, arrays compared by kind, shape and content, NaN as itself.
+    Copies and pickles hold the fields alone: what is cached is worked out anew.
+    """
+
+    def __post_init__(self) -> None:
+        freeze(*(x for x in self._parts() if isinstance(x, np.ndarray)))
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        if type(self) is not type(other) or not isinstance(other, Frozen):
+            return NotImplemented
+        return all(map(_equal, self._parts(), other._parts()))
+
+    def __hash__(self) -> int:
+        return hash((type(self), *map(_key, self._parts())))
+
+    def _parts(self) -> list[Any]:
+        return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        freeze(*(x for x in self._parts() if isinstance(x, np.ndarray)))
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        kind = "fc" if a.dtype.kind in "fc" else ""
+        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=bool(kind))
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(_equal, a, b))
+    if isinstance(a, float) and isinstance(b, float):
+        return a == b or (a != a and b != b)
+    return bool(a == b)
+
+
+def _key(value: Any) -> Any:
+    """Return something to hash that is equal for equal parts."""
+    if isinstance(value, np.ndarray):
+        return value.shape, value.dtype.str
+    if isinstance(value, tuple):
+        return tuple(map(_key, value))
+    if isinstance(value, float):
+        return None if value != value else value
+    try:
+        hash(value)
+    except TypeError:  # a dict, say
+        return type(value)
+    return value
