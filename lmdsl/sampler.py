@@ -20,12 +20,16 @@ from lmdsl.merging import mean_cost
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.program import Program
+from lmdsl.systems.function import Audit, FunctionStep
 
 CHUNK = 2**17
 """Samples evaluated at a time: few enough to stay in cache, many enough to keep threads apart."""
 
 LEAST_LINE = 64
 """Pairs side by side below which arithmetic line by line does not pay: its lines are as short."""
+
+FEW = 16
+"""Cells and controls of which a function is asked twice."""
 
 Floats = NDArray[np.float64]
 
@@ -124,6 +128,15 @@ class Sampler:
             named[name] = u[:, None, None, None] if cells_last else u[None, None, None, :]
         named.update(self._noise)
         return named
+
+    def audit(self, cells: NDArray[np.int64]) -> Audit | None:
+        """Ask a user's function about a few pairs, before all; None for formulas."""
+        if not isinstance(self.step, FunctionStep) or not len(cells):
+            return None
+        width = min(len(self.controls), FEW)
+        count = max(1, min(len(cells), FEW, CHUNK // (self.samples * width)))
+        few = cells[np.linspace(0, len(cells) - 1, count).astype(int)]
+        return self.step.audit(self.values(Block(0, few, (0, width))))
 
     def outcomes(self, block: Block) -> tuple[Floats, Floats]:
         """Return :meth:`images` and :meth:`costs` of a block."""

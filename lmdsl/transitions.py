@@ -106,6 +106,7 @@ def assemble(
     memory.require(estimate(problem), "a lower estimate, before sampling")
     regions = Regions.of(problem, partition)
     sampler = Sampler(problem, partition)
+    audit = sampler.audit(regions.free)
     pilot = _pilot(sampler, regions)
     memory.require(estimate(problem, pilot), "estimated from a few cells")
     F, M = len(regions.free), len(sampler.controls)
@@ -131,6 +132,8 @@ def assemble(
         done += block.lanes
         if progress:
             progress("transitions", done / (F * M))
+    if audit is not None:
+        audit.again()
     return Transitions(
         regions=regions,
         pair_pointer=np.cumsum(pair_pointer, out=pair_pointer),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from lmdsl.systems.base import FunctionSystem, MapSystem, NamedSystem, OdeSystem, System
+from lmdsl.systems.base import MapSystem, NamedSystem, OdeSystem, System
 from lmdsl.systems.double_integrator import DoubleIntegrator
+from lmdsl.systems.function import FunctionSystem
 from lmdsl.systems.henon_map import HenonMap
 from lmdsl.systems.inverted_pendulum import InvertedPendulum
 from lmdsl.systems.logistic_map import LogisticMap
