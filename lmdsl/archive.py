@@ -96,6 +96,8 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
     BadInput
         The place cannot be used.
     """
+    if result.lp is None and not result.model_sha256:
+        raise BadInput("there is no model to save: " + result.message, "out")
     refuse_unless_free(path)
     target = Path(path).absolute()
     try:

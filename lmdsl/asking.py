@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 from lmdsl import backends, elimination, policy
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.scaled import failure
+from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput, MissingDependency, plain_text
 from lmdsl.lp import StabilizationLP
 
@@ -74,15 +74,10 @@ def _copies(lp: StabilizationLP, options: Options) -> tuple[StabilizationLP, Opt
 
 def _without_suboptimal(lp: StabilizationLP, options: Options) -> tuple[Pairs, Options]:
     """Return the columns worth solving for, and the options for a model of these alone."""
-    started, limit, start = monotonic(), options.time_limit, options.start
+    late, start = Deadline(options.time_limit), options.start
     assert start is not None
-
-    def late() -> bool:
-        return limit is not None and monotonic() - started > limit
-
     kept = elimination.survivors(lp, start, options.proof, late)
-    left = None if limit is None else max(limit - (monotonic() - started), 1e-9)
-    return kept, replace(options, time_limit=left, start=np.searchsorted(kept, start))
+    return kept, replace(options, time_limit=late.left, start=np.searchsorted(kept, start))
 
 
 def _plain(lp: StabilizationLP, found: Any) -> Solution:

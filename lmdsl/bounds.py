@@ -18,6 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl.bellman import over_cells, padded
+from lmdsl.linear import Stop, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.sweeps import ONE
 
@@ -137,7 +138,12 @@ def exactly_below(
 
 
 def lower_until_below(
-    lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None, sweeps: int = 60
+    lp: StabilizationLP,
+    x: Floats,
+    gamma: float,
+    cost: Floats | None,
+    sweeps: int = 60,
+    stop: Stop = never,
 ) -> Floats | None:
     """Lower x until x <= gamma P_a x + G_a holds for every pair; None where it does not settle.
 
@@ -146,6 +152,8 @@ def lower_until_below(
     """
     x = x.copy()
     for _ in range(sweeps):
+        if stop():
+            break
         open_pairs = undecided(lp, x, gamma, cost)
         if open_pairs is None:
             x = np.minimum(x, backup_below(lp, x, gamma, cost))
@@ -162,7 +170,9 @@ def lower_until_below(
     return None
 
 
-def raise_from_zero(lp: StabilizationLP, gamma: float, cost: Floats, sweeps: int) -> Floats:
+def raise_from_zero(
+    lp: StabilizationLP, gamma: float, cost: Floats, sweeps: int, stop: Stop = never
+) -> Floats:
     """Return value iterates from 0, rounded down: x <= T x holds along the whole way.
 
     x_{k+1} = max(x_k, rounded-down T x_k) <= T x_k <= T x_{k+1}, as T is monotone.
@@ -170,7 +180,7 @@ def raise_from_zero(lp: StabilizationLP, gamma: float, cost: Floats, sweeps: int
     x = np.zeros(lp.n)
     for _ in range(sweeps):
         y = np.maximum(x, backup_below(lp, x, gamma, cost))
-        if np.all(y - x <= 1e-12 * y):
+        if stop() or np.all(y - x <= 1e-12 * y):
             return y
         x = y
     return x

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from lmdsl import backends, bellman
+from lmdsl.deadline import TimeLimitReached
 from lmdsl.errors import BadInput, shown
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.result import Result
-from lmdsl.stabilize import TOLERANCE, solve
+from lmdsl.stabilize import TOLERANCE, not_compiled, solve
 from lmdsl.transitions import Progress
 
 
@@ -121,8 +123,10 @@ def compare(
         A problem, or its compiled LP.
     backends
         As for :func:`lmdsl.solve`, each alone or with an algorithm: ``"highs:simplex"``.
-    tolerance, time_limit, progress
+    tolerance, progress
         As for :func:`lmdsl.solve`.
+    time_limit
+        Seconds for compiling, and again for each backend.
 
     Raises
     ------
@@ -135,7 +139,15 @@ def compare(
         raise BadInput(f"{shown(problem)} is neither a Problem nor a compiled LP", "problem")
     if not backends:
         raise BadInput("no backend is named; name at least one", "backends")
-    lp = compile(problem, progress) if isinstance(problem, Problem) else problem
+    if isinstance(problem, Problem):
+        began = time.perf_counter()
+        try:
+            lp = compile(problem, progress, time_limit)
+        except TimeLimitReached as error:
+            known = problem, tolerance, error, time.perf_counter() - began
+            return Comparison(tuple(not_compiled(name, *known) for name in backends), None)
+    else:
+        lp = problem
     results = tuple(
         solve(lp, backend, tolerance=tolerance, time_limit=time_limit, progress=progress)
         for backend in backends

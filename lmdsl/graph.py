@@ -27,6 +27,7 @@ from numba import njit, types
 from numpy.typing import NDArray
 
 from lmdsl import threads
+from lmdsl.deadline import Deadline
 from lmdsl.rows import Rows
 from lmdsl.sweeps import ONE
 from lmdsl.transitions import Transitions
@@ -93,8 +94,11 @@ class Stabilizable:
     pair: NDArray[np.int64]
 
 
-def stabilizable(pair_pointer: NDArray[np.int64], rows: Rows) -> Stabilizable:
+def stabilizable(
+    pair_pointer: NDArray[np.int64], rows: Rows, deadline: Deadline | None = None
+) -> Stabilizable:
     """Return the greatest set from which A is reached almost surely, and the pairs it keeps."""
+    deadline = Deadline.of(deadline)
     before: Predecessors | None = None
     alive = np.ones(rows.count, dtype=np.bool_)
     inside = np.ones(rows.columns, dtype=np.bool_)
@@ -108,6 +112,7 @@ def stabilizable(pair_pointer: NDArray[np.int64], rows: Rows) -> Stabilizable:
         lost = np.flatnonzero(inside & ~reached)
         if not len(lost):
             return Stabilizable(inside, alive, reaches, level, pair)
+        deadline.check("looking for the stabilizable set")
         before = before or Predecessors.of(rows)
         cell = owner(pair_pointer)
         _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)

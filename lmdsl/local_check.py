@@ -7,27 +7,32 @@ image of each (jets.py) meets attractor cells only.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.intervals import Interval, add, intersection, multiply, subtract
 from lmdsl.jets import Jet, apply
 from lmdsl.local import LocalController
 from lmdsl.partition import EDGE, Partition
 from lmdsl.problem import Problem
+from lmdsl.program import FUNCTION
 from lmdsl.sampling import noise_nodes
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SAMPLES = 10_000
+SAMPLES, FEWEST = 10_000, 10
+SAMPLED_WORK = 1e10  # additions that take as long as all samples: some seconds
 CHUNK = 8192  # cells enclosed at a time
 WORK = 2e7  # most operations on boxes that an enclosure may take: some seconds
 OVERHEAD = 1000  # boxes whose arithmetic costs as much as NumPy's own work for an operation
 ROUNDS = 14  # most halvings of an axis
 MEETS = 512  # most cells that the image of a box may meet
+DOING = "checking the local controller"
 
 
 @dataclass(frozen=True)
@@ -46,7 +51,8 @@ class LocalCheck:
         Of these, cells whose every point is mapped into A: enclosed by interval arithmetic. None
         for a system written in Python, which cannot be enclosed.
     samples, kept
-        Random states of A, and how many of them are mapped into A by every noise node.
+        Random states of A, and how many of them are mapped into A by every noise node. Fewer where
+        there are many nodes or operations, or no more time.
     """
 
     kind: str
@@ -71,44 +77,91 @@ class LocalCheck:
         return line
 
 
-def check(problem: Problem, local: LocalController) -> LocalCheck:
-    """Check whether the local controller of a problem keeps the attractor cells."""
+def check(
+    problem: Problem,
+    local: LocalController,
+    deadline: Deadline | None = None,
+    samples: int | None = None,
+) -> LocalCheck:
+    """Check whether the local controller of a problem keeps the attractor cells.
+
+    Parameters
+    ----------
+    problem, local
+        The problem and its local controller.
+    deadline
+        Ends the work with what is known.
+    samples
+        How many random states to try; by default as many as take some seconds.
+    """
     cells = np.flatnonzero(local.attractor)
-    samples = int(min(SAMPLES, max(1e7 // len(noise_nodes(problem).values), 100)))
+    asked, nodes = Deadline.of(deadline), noise_nodes(problem).values
+    if samples is None:
+        work = getattr(problem.step(), "work", FUNCTION) * len(nodes)
+        samples = int(min(SAMPLES, max(SAMPLED_WORK // work, FEWEST)))
+    proved = _proved(problem, local, cells, nodes, asked)
+    samples, kept = _sampled(problem, local, cells, nodes, samples, asked)
     return LocalCheck(
         kind="constant" if problem.local_controller is None else problem.local_controller.kind,
         multiplier=local.multiplier,
         cells=len(cells),
-        proved=_proved(problem, local, cells),
+        proved=proved,
         samples=samples,
-        kept=_sampled(problem, local, cells, samples),
+        kept=kept,
     )
 
 
-def _sampled(problem: Problem, local: LocalController, cells: Indices, count: int) -> int:
+def _sampled(
+    problem: Problem,
+    local: LocalController,
+    cells: Indices,
+    nodes: Floats,
+    count: int,
+    deadline: Deadline,
+) -> tuple[int, int]:
+    """Return how many states were tried in time, and how many of them stay."""
     rng = np.random.default_rng(0)
     cell = cells[rng.integers(len(cells), size=count)]
     partition = local.partition
     index = np.stack(partition.multi_index(cell), axis=-1)
     x = partition.low + (index + rng.random(index.shape)) * partition.width
-    return int(_stays(problem, local, x, cell).sum())
+    kept, part = 0, max(FEWEST, CHUNK // len(nodes))
+    for start in range(0, count, part):
+        some = slice(start, min(start + part, count))
+        try:
+            kept += int(_stays(problem, local, x[some], cell[some], nodes, deadline).sum())
+        except TimeLimitReached:
+            return start, kept
+    return count, kept
 
 
-def _stays(problem: Problem, local: LocalController, x: Floats, cell: Indices) -> NDArray[np.bool_]:
+def _stays(
+    problem: Problem,
+    local: LocalController,
+    x: Floats,
+    cell: Indices,
+    nodes: Floats,
+    deadline: Deadline,
+) -> NDArray[np.bool_]:
     """Return which states of attractor cells are mapped into A by every noise node."""
     u = local(x, cell)
-    values = {name: x[:, k] for k, name in enumerate(problem.states)}
-    values |= {name: u[:, k] for k, name in enumerate(problem.controls)}
+    values = {name: x[:, k, None] for k, name in enumerate(problem.states)}
+    values |= {name: u[:, k, None] for k, name in enumerate(problem.controls)}
     step, stays = problem.step(), np.ones(len(x), dtype=np.bool_)
-    for node in noise_nodes(problem).values:
-        noise = {name: np.full(len(x), node[j]) for j, name in enumerate(problem.noises)}
-        images = [np.broadcast_to(y, len(x)) for y in step({**values, **noise})]
-        target = local.partition.locate(images)
-        stays &= (target >= 0) & local.attractor[target]
+    width = max(1, CHUNK // max(len(x), 1))
+    for start in range(0, len(nodes), width):
+        some = nodes[start : start + width]
+        noise = {name: some[None, :, j] for j, name in enumerate(problem.noises)}
+        shape = len(x), len(some)
+        images = step({**values, **noise}, partial(deadline.check, DOING))
+        target = local.partition.locate([np.broadcast_to(y, shape) for y in images])
+        stays &= ((target >= 0) & local.attractor[target]).all(axis=1)
     return stays
 
 
-def _proved(problem: Problem, local: LocalController, cells: Indices) -> int | None:
+def _proved(
+    problem: Problem, local: LocalController, cells: Indices, nodes: Floats, deadline: Deadline
+) -> int | None:
     """Count the cells that are mapped into A as a whole; None where no formula allows it.
 
     Cells that are still undecided when the work is used up count as not proved.
@@ -116,11 +169,14 @@ def _proved(problem: Problem, local: LocalController, cells: Indices) -> int | N
     step = problem.step()
     if not hasattr(step, "enclose"):
         return None
-    nodes = noise_nodes(problem).values
     per_box = float(step.effort) * len(nodes) * (1 + local.partition.dimension)
     proved, work = 0, WORK
     for start in range(0, len(cells), CHUNK):
-        kept, spent = _kept(problem, local, cells[start : start + CHUNK], nodes, work / per_box)
+        some = cells[start : start + CHUNK]
+        try:
+            kept, spent = _kept(problem, local, some, nodes, work / per_box, deadline)
+        except TimeLimitReached:
+            break
         proved += kept
         work -= spent * per_box
         if work <= 0:
@@ -129,7 +185,12 @@ def _proved(problem: Problem, local: LocalController, cells: Indices) -> int | N
 
 
 def _kept(
-    problem: Problem, local: LocalController, cells: Indices, nodes: Floats, limit: float
+    problem: Problem,
+    local: LocalController,
+    cells: Indices,
+    nodes: Floats,
+    limit: float,
+    deadline: Deadline,
 ) -> tuple[int, float]:
     """Return how many of some cells are proved, and the work in boxes.
 
@@ -151,10 +212,11 @@ def _kept(
         inside = np.ones(len(home), dtype=np.bool_)
         with np.errstate(all="ignore"):
             for node in nodes:
+                deadline.check(DOING)
                 images = _images(problem, local, step, cells[home], low, high, node)
                 inside &= _into(partition, local.attractor, images)
         centre = low / 2 + high / 2
-        lost[home[~_stays(problem, local, centre, cells[home])]] = True
+        lost[home[~_stays(problem, local, centre, cells[home], nodes, deadline)]] = True
         open_ = ~inside & ~lost[home]
         low, high, home = low[open_], high[open_], home[open_]
         axis = np.argmax((high - low) / partition.width, axis=1)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import graph
+from lmdsl.deadline import Deadline
 from lmdsl.directions import Directions
 from lmdsl.errors import BadInput
 from lmdsl.files import write_whole
@@ -252,7 +253,11 @@ class StabilizationLP(Frozen):
         )
 
 
-def compile(problem: Problem, progress: Progress | None = None) -> StabilizationLP:  # noqa: A001
+def compile(  # noqa: A001
+    problem: Problem,
+    progress: Progress | None = None,
+    time_limit: float | Deadline | None = None,
+) -> StabilizationLP:
     """Compile a problem: transitions, stabilizable set and the LP on it.
 
     Parameters
@@ -261,19 +266,24 @@ def compile(problem: Problem, progress: Progress | None = None) -> Stabilization
         The declared problem.
     progress
         Called with (stage, fraction done) during long work.
+    time_limit
+        Seconds. What takes a moment is compiled whatever the limit.
 
     Raises
     ------
+    TimeLimitReached
+        The time limit was reached.
     BadInput
         The declared sets have no cells, the stage cost is negative or not finite, or the problem
         does not fit in memory.
     """
+    deadline = Deadline.of(time_limit)
     partition = Partition.of(problem)
     if problem.local_controller is not None:  # refuse a wrong one before the work
         LocalController.of(problem, partition, Regions.of(problem, partition).attractor)
-    transitions = assemble(problem, partition, progress)
+    transitions = assemble(problem, partition, progress, deadline)
     regions = transitions.regions
-    found = graph.stabilizable(transitions.pair_pointer, transitions.rows)
+    found = graph.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
     kept, pair_pointer, rows = graph.restrict(transitions, found)
     status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)
     status[regions.free] = graph.causes(found, transitions.pair_pointer)

@@ -247,7 +247,11 @@ def bound(lp: StabilizationLP, pair: Pairs, w: Floats | None = None) -> Floats |
 
 
 def canonical(
-    lp: StabilizationLP, pair: Pairs, value: Floats, screen: Screen | None = None
+    lp: StabilizationLP,
+    pair: Pairs,
+    value: Floats,
+    screen: Screen | None = None,
+    stop: Stop = never,
 ) -> Pairs:
     """Break ties so that the policy reaches A: the policy that every backend ends with.
 
@@ -261,6 +265,8 @@ def canonical(
         The model, an optimal policy and its value.
     screen
         Lower bounds of the rivals of each cell's control at this value, where they are known.
+    stop
+        Ends the work, with :class:`lmdsl.linear.Stopped`.
     """
     if screen is None:
         screen = Screen(lp)
@@ -279,13 +285,15 @@ def canonical(
     owned = columns[start] == pair[inside]
     if not owned.all():
         start = np.where(owned, start, sub.tree[1])
-    w = evaluate(sub, start, lp.growth, unit)
+    w = evaluate(sub, start, lp.growth, unit, stop=stop)
     if w is None:
         start = sub.tree[1]
-        w = evaluate(sub, start, lp.growth, unit)
+        w = evaluate(sub, start, lp.growth, unit, stop=stop)
     if w is None:
         return pair
-    done = iterate(sub, start, w, lp.growth, unit)
+    done = iterate(sub, start, w, lp.growth, unit, stop=stop)
+    if stop():
+        raise Stopped
     least = bellman.improve(sub, done.value, lp.growth, unit).value
     equal = bellman.tied(replace(sub, gamma=lp.growth, cost=unit), done.value, least, TIE)
     chosen = first.copy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from lmdsl.errors import BadInput
 from lmdsl.formulas import OPERATIONS, PLAIN, Formula, Step, fold
 from lmdsl.jets import Jet, apply
+
+Check = Callable[[], object]
+"""Asked during long evaluations whether to go on; it raises if not."""
 
 
 class Instruction(NamedTuple):
@@ -47,8 +50,9 @@ class Program:
         What a call does, and the slots of its results.
     operations
         The operations of one call in order, for inspection.
-    effort
-        Their number, at least 1.
+    effort, work
+        Their number, at least 1; the same with functions such as the sine counted many times, for
+        the time they take.
     """
 
     def __init__(self, formulas: Sequence[Formula], constants: Mapping[str, float] = {}) -> None:
@@ -72,7 +76,7 @@ class Program:
         self.instructions = self._with_lifetimes(_needed(instructions, self.outputs))
         self.names = frozenset(self.variables)
         self.operations = tuple(step.operation for step in instructions)
-        self.effort = max(len(instructions), 1)
+        self.effort, self.work = _effort(self.operations)
 
     def _identify(
         self, step: Step, operands: Sequence[int], constants: Mapping[str, float]
@@ -111,11 +115,11 @@ class Program:
         part.instructions = part._with_lifetimes(steps)
         part.names, part.formulas = frozenset(part.variables), ()
         part.operations = tuple(step.operation for step in part.instructions)
-        part.effort = max(len(part.instructions), 1)
+        part.effort, part.work = _effort(part.operations)
         return part
 
     def __call__(
-        self, values: Mapping[str, NDArray[Any] | float]
+        self, values: Mapping[str, NDArray[Any] | float], check: Check | None = None
     ) -> tuple[NDArray[np.float64], ...]:
         """Evaluate all formulas.
 
@@ -124,6 +128,8 @@ class Program:
         values
             An array or number for each of `names`, in shapes that broadcast together.
             They are read as float64 and never changed; other keys are ignored.
+        check
+            Called before every operation; it may raise.
 
         Returns
         -------
@@ -138,6 +144,8 @@ class Program:
             slots[slot] = np.asarray(values[name], dtype=np.float64)
         with np.errstate(all="ignore"):
             for operation, places, target, released, reusable in self.instructions:
+                if check is not None:
+                    check()
                 operands = [slots[k] for k in places]
                 room = _room(operands, [slots[k] for k in reusable]) if reusable else {}
                 slots[target] = OPERATIONS[operation](*operands, **room)
@@ -151,13 +159,15 @@ class Program:
             aliases.add(slot)
         return tuple(results)
 
-    def enclose(self, values: Mapping[str, Jet]) -> tuple[Jet, ...]:
+    def enclose(self, values: Mapping[str, Jet], check: Check | None = None) -> tuple[Jet, ...]:
         """Enclose all formulas and their derivatives on boxes (see jets.py).
 
         Parameters
         ----------
         values
             A jet for each of `names`, all with the same number of directions.
+        check
+            Called before every operation; it may raise.
         """
         directions = max((len(jet.slope.low) for jet in values.values()), default=0)
         slots: list[Any] = [
@@ -167,8 +177,20 @@ class Program:
             slots[slot] = values[name]
         with np.errstate(all="ignore"):
             for step in self.instructions:
+                if check is not None:
+                    check()
                 slots[step.target] = apply(step.operation, [slots[k] for k in step.operands])
         return tuple(slots[slot] for slot in self.outputs)
+
+
+FUNCTION = 40
+"""Additions that take as long as a sine or a cosine, the slowest functions there are."""
+
+
+def _effort(operations: Sequence[str]) -> tuple[int, int]:
+    """Return the number of operations, and the additions that take as long."""
+    plain = sum(operation in PLAIN for operation in operations)
+    return max(len(operations), 1), max(plain + FUNCTION * (len(operations) - plain), 1)
 
 
 def _needed(instructions: Sequence[Instruction], outputs: Sequence[int]) -> list[Instruction]:

@@ -9,12 +9,14 @@ Plain arithmetic with the control is done line by line instead (lines.py), to th
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import sampling
+from lmdsl.deadline import Deadline
 from lmdsl.lines import Lines
 from lmdsl.merging import mean_cost
 from lmdsl.partition import Partition
@@ -84,17 +86,29 @@ class Sampler:
         Number of samples S of a pair; sample s is point ``s // nodes`` and node ``s % nodes``.
     controls
         Control vectors, shape (M, p).
+    work
+        Additions that take as long as a sample; infinite for a Python function.
+    step, cost
+        Map and stage cost of named arrays; they raise once the deadline has passed.
     """
 
-    def __init__(self, problem: Problem, partition: Partition) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        partition: Partition,
+        deadline: Deadline | None = None,
+        doing: str = "compiling",
+    ) -> None:
         self.problem, self.partition = problem, partition
         self.points = sampling.offsets(problem)
         self.controls = sampling.control_vectors(problem)
         self.nodes = sampling.noise_nodes(problem)
         self.samples = len(self.points) * len(self.nodes.weights)
-        self.step = _step(problem)
-        self.cost = Program([problem.cost()], problem.system.constants())
-        self._images, self._costs = _split(problem, self.step, self.cost)
+        step, cost = _step(problem), Program([problem.cost()], problem.system.constants())
+        self._images, self._costs = _split(problem, step, cost)
+        self.work = getattr(step, "work", np.inf) + cost.work
+        check = None if deadline is None else partial(deadline.check, doing)
+        self.step, self.cost = partial(step, check=check), partial(cost, check=check)
         self._offset = np.ascontiguousarray(self.points.T)[:, :, None]
         self._control = np.ascontiguousarray(self.controls.T)
         self._noise = {
@@ -131,12 +145,13 @@ class Sampler:
 
     def audit(self, cells: NDArray[np.int64]) -> Audit | None:
         """Ask a user's function about a few pairs, before all; None for formulas."""
-        if not isinstance(self.step, FunctionStep) or not len(cells):
+        step = self.step.func
+        if not isinstance(step, FunctionStep) or not len(cells):
             return None
         width = min(len(self.controls), FEW)
         count = max(1, min(len(cells), FEW, CHUNK // (self.samples * width)))
         few = cells[np.linspace(0, len(cells) - 1, count).astype(int)]
-        return self.step.audit(self.values(Block(0, few, (0, width))))
+        return step.audit(self.values(Block(0, few, (0, width))))
 
     def outcomes(self, block: Block) -> tuple[Floats, Floats]:
         """Return :meth:`images` and :meth:`costs` of a block."""

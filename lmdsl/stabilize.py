@@ -13,17 +13,24 @@ from lmdsl import backends, bellman, certificate, feasibility, gamma, policy
 from lmdsl.asking import ask
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.certificate import Certificate, Verified, Witness
+from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.errors import BadInput, shown
 from lmdsl.graph import CellStatus
+from lmdsl.linear import Stopped
 from lmdsl.local import LocalController
 from lmdsl.local_check import check
 from lmdsl.lp import StabilizationLP, compile
+from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.result import Result, Seconds
+from lmdsl.sampling import control_count, control_vectors
 from lmdsl.transitions import Progress
 from lmdsl.witness import certify
 
 TOLERANCE = 1e-6
+UNKNOWN = 255
+"""Status of cells of which nothing is known."""
+
 Pairs = NDArray[np.int64]
 
 
@@ -32,7 +39,7 @@ def solve(
     backend: str | Backend = backends.DEFAULT,
     *,
     tolerance: float = TOLERANCE,
-    time_limit: float | None = None,
+    time_limit: float | Deadline | None = None,
     max_iterations: int | None = None,
     require_all: bool = False,
     restrict_to_gamma: bool = False,
@@ -50,7 +57,8 @@ def solve(
     tolerance
         Largest gap that counts as verified.
     time_limit
-        Seconds for the backend.
+        Seconds for compiling and solving. What was found by then is verified, for as long again at
+        most, or two seconds. A problem that compiles in a moment is compiled whatever the limit.
     max_iterations
         Iterations in the backend's own sense.
     require_all
@@ -64,28 +72,32 @@ def solve(
     Returns
     -------
     Result
-        Also for unverified, not stabilizable and failed solves.
+        Also for unverified, not stabilizable and failed solves, and where the time was up before
+        the problem was compiled.
 
     Raises
     ------
     BadInput
         The problem or an option cannot be used.
     """
-    _check_options(problem, tolerance, time_limit, max_iterations)
+    _check_options(problem, tolerance, max_iterations)
+    late = Deadline.of(time_limit)
     chosen, algorithm = backends.resolve(backend)
     started = time.perf_counter()
-    lp = compile(problem, progress) if isinstance(problem, Problem) else problem
-    compiled = time.perf_counter() - started if isinstance(problem, Problem) else None
+    compiled = None
+    if isinstance(problem, Problem):
+        try:
+            lp = compile(problem, progress, late)
+        except TimeLimitReached as error:
+            return not_compiled(backend, problem, tolerance, error, time.perf_counter() - started)
+        compiled = time.perf_counter() - started
+    else:
+        lp = problem
     job = _Job(lp, chosen, tolerance, compiled, backend if isinstance(backend, str) else None)
     refused = _not_stabilizable(lp, require_all)
     if refused:
         return job.refused(*refused)
     started = time.perf_counter()
-    deadline = None if time_limit is None else time.monotonic() + time_limit
-
-    def late() -> bool:
-        return deadline is not None and time.monotonic() > deadline
-
     first = feasibility.stabilizing(lp, late)
     if isinstance(first, feasibility.Refused):
         verified = _refuse(lp, first, tolerance)
@@ -97,7 +109,7 @@ def solve(
                     smaller,
                     backend,
                     tolerance=tolerance,
-                    time_limit=time_limit,
+                    time_limit=late,
                     max_iterations=max_iterations,
                     require_all=require_all,
                     restrict_to_gamma=True,
@@ -112,7 +124,7 @@ def solve(
         first = feasibility.Undecided(first.pair, first.lower)
     options = Options(
         tolerance=tolerance,
-        time_limit=None if deadline is None else max(deadline - time.monotonic(), 1e-9),
+        time_limit=late.left,
         max_iterations=max_iterations,
         algorithm=algorithm,
         start=first.pair,
@@ -134,19 +146,49 @@ def solve(
     if progress:
         progress("verify", -1.0)
     started = time.perf_counter()
-    verified = certify(lp, outcome.pair, tolerance, outcome.value)
+    job.finish = late.again()
+    verified = certify(lp, outcome.pair, tolerance, outcome.value, job.finish)
     job.verify_seconds = time.perf_counter() - started
     undecided = isinstance(first, feasibility.Undecided) and not late()
     return job.solved(solution, outcome, verified, undecided)
 
 
-def _check_options(problem: Any, tolerance: Any, time_limit: Any, max_iterations: Any) -> None:
+def not_compiled(
+    backend: str | Backend, problem: Problem, tolerance: float, error: Exception, seconds: float
+) -> Result:
+    """Return what is known of a problem that there was no time to compile."""
+    partition = Partition.of(problem)
+    N = partition.size
+    message = str(error)
+    certificate = Certificate(*(False,) * 5, *(None,) * 5, tolerance=tolerance, reasons=(message,))
+    return Result(
+        status="solver_failed",
+        backend=backend if isinstance(backend, str) else backend.name,
+        solver_status="time limit",
+        gamma=problem.gamma,
+        tolerance=tolerance,
+        cells=N,
+        controls=control_count(problem),
+        seconds=Seconds(compile=seconds),
+        message=message,
+        problem=problem,
+        partition=partition,
+        certificate=certificate,
+        control_index=np.full(N, -1, dtype=np.int32),
+        value=np.full(N, np.inf),
+        lower=np.zeros(N),
+        measure=np.zeros(N),
+        cell_status=np.full(N, UNKNOWN, dtype=np.uint8),
+        witness=np.zeros(N),
+        control_vectors=control_vectors(problem),
+    )
+
+
+def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:
     if not isinstance(problem, Problem | StabilizationLP):
         raise BadInput(f"{shown(problem)} is neither a Problem nor a compiled LP", "problem")
     if not _number(tolerance) or not 0 <= tolerance < np.inf:
         raise BadInput(f"{shown(tolerance)} must be a finite number >= 0", "tolerance")
-    if time_limit is not None and (not _number(time_limit) or not time_limit > 0):
-        raise BadInput(f"{shown(time_limit)} must be a number of seconds > 0", "time_limit")
     if max_iterations is not None and not (
         isinstance(max_iterations, int | np.integer) and max_iterations >= 1
     ):
@@ -208,7 +250,7 @@ def _polish(
     iteration: policy.Iteration | None,
     start: Pairs,
     tolerance: float,
-    stop: policy.Stop,
+    stop: Deadline,
 ) -> _Outcome:
     """Improve a backend's policy exactly until nothing is strictly better, then break ties.
 
@@ -216,21 +258,24 @@ def _polish(
     left as it is: a limit is not a license to go on.
     """
     if iteration is not None and solution.stop.success:  # it ends where polishing would begin
-        return _tidied(lp, iteration, tolerance, 0, None)
+        return _tidied(lp, iteration, tolerance, 0, None, stop)
     pair = _claimed(lp, solution)
     if pair is not None and not _usable(lp, pair, solution.value):
         pair = None
     if pair is None:
         pair = start
     guess = None if solution.pair is None else solution.value
-    value = policy.evaluate(lp, pair, start=guess, transient=lp.gamma >= 1)
+    try:
+        value = policy.evaluate(lp, pair, start=guess, transient=lp.gamma >= 1, stop=stop.again())
+    except Stopped:
+        value = None
     if value is None or solution.stop.limit:
         return _Outcome(pair, value, 0, None)
     done = policy.iterate(lp, pair, value, stop=stop)
     gap_before = None
     if done.steps:
-        gap_before = certify(lp, pair, tolerance, value).certificate.gap
-    return _tidied(lp, done, tolerance, done.steps, gap_before)
+        gap_before = certify(lp, pair, tolerance, value, stop.again()).certificate.gap
+    return _tidied(lp, done, tolerance, done.steps, gap_before, stop)
 
 
 def _tidied(
@@ -239,9 +284,13 @@ def _tidied(
     tolerance: float,
     steps: int,
     gap_before: float | None,
+    stop: Deadline,
 ) -> _Outcome:
     """Break ties; where that costs more than the tolerance the strict minimisers stay."""
-    tidy = policy.canonical(lp, done.pair, done.value, done.screen)
+    try:
+        tidy = policy.canonical(lp, done.pair, done.value, done.screen, stop)
+    except Stopped:
+        tidy = done.pair
     if (tidy != done.pair).any() and _usable(lp, tidy, done.value):
         tidy_value = policy.evaluate(lp, tidy, start=done.value, transient=lp.gamma >= 1)
         limit = (1 + tolerance / 4) * certificate.weighted(lp, done.value)
@@ -268,6 +317,7 @@ class _Job:
     ) -> None:
         self.lp, self.tolerance, self.compile_seconds = lp, tolerance, compile_seconds
         self.backend = spec or backend.name
+        self.finish = Deadline()
         self.solve_seconds: float | None = None
         self.verify_seconds: float | None = None
 
@@ -357,7 +407,7 @@ class _Job:
             pairs=lp.K,
             attractor_cells=int(attractor.sum()),
             stabilizable_cells=n,
-            local_controller=None if local is None else check(lp.problem, local),
+            local_controller=None if local is None else check(lp.problem, local, self.finish),
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
             message=message,
             problem=lp.problem,

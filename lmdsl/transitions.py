@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import memory, sampling, threads
+from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput
 from lmdsl.merging import merge, tile
 from lmdsl.partition import Partition
@@ -92,20 +93,48 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     return int(min(model + max(N * copied + blocks, N * solving) + grids, 1e30))
 
 
+SHORT = 2e9
+"""Additions up to which compiling takes a moment, and is not ended for the time it takes."""
+
+
 def assemble(
-    problem: Problem, partition: Partition, progress: Progress | None = None
+    problem: Problem,
+    partition: Partition,
+    progress: Progress | None = None,
+    deadline: Deadline | None = None,
 ) -> Transitions:
     """Build the rows of every admissible pair.
 
     Raises
     ------
+    TimeLimitReached
+        The deadline has passed, and it was more than a moment's work.
     BadInput
         The problem does not fit in memory, or the stage cost of an admissible pair is negative
         or not finite at a sample.
     """
     memory.require(estimate(problem), "a lower estimate, before sampling")
     regions = Regions.of(problem, partition)
-    sampler = Sampler(problem, partition)
+    deadline = Deadline.of(deadline)
+    sampler = Sampler(problem, partition, deadline)
+    F, M = len(regions.free), len(sampler.controls)
+    if F * M * sampler.samples * sampler.work <= SHORT:
+        deadline = Deadline()
+        sampler = Sampler(problem, partition)
+    try:
+        return _assembled(problem, regions, sampler, progress, deadline)
+    except BaseException:
+        deadline.cancel()  # threads that help may be far from the end of their blocks
+        raise
+
+
+def _assembled(
+    problem: Problem,
+    regions: Regions,
+    sampler: Sampler,
+    progress: Progress | None,
+    deadline: Deadline,
+) -> Transitions:
     audit = sampler.audit(regions.free)
     pilot = _pilot(sampler, regions)
     memory.require(estimate(problem, pilot), "estimated from a few cells")
@@ -130,6 +159,7 @@ def assemble(
         target.append(rows.target)
         code.append(rows.code)
         done += block.lanes
+        deadline.check("compiling")
         if progress:
             progress("transitions", done / (F * M))
     if audit is not None:

@@ -22,6 +22,7 @@ from lmdsl.exact import check_exactly
 from lmdsl.gamma import restricted
 from lmdsl.graph import CellStatus
 from lmdsl.local import LocalController
+from lmdsl.local_check import SAMPLES
 from lmdsl.local_check import check as check_local
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.regions import Regions
@@ -192,7 +193,7 @@ def _judge_local(lp: StabilizationLP, result: Result) -> list[str]:
     local = LocalController.of(problem, lp.partition, lp.cell_status == CellStatus.ATTRACTOR)
     if local is None:
         return ["a local controller is stored, but the problem names none"]
-    found = check_local(problem, local)
+    found = check_local(problem, local, samples=min(max(stored.samples, 0), SAMPLES))
     claims = [
         ("multiplier", -(stored.multiplier or 0.0), -(found.multiplier or 0.0) * (1 - 1e-9)),
         ("proved", stored.proved or 0, found.proved or 0),

@@ -24,6 +24,7 @@ from lmdsl.certificate import (
     gap,
     weighted,
 )
+from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.peeling import Peeled
 
@@ -43,6 +44,7 @@ def certify(
     pair: Pairs,
     tolerance: float,
     value: Floats | None = None,
+    stop: Stop = never,
 ) -> Verified:
     """Make the vectors of claims 1 to 4 for a policy and check them.
 
@@ -54,17 +56,22 @@ def certify(
         Largest gap that counts as verified.
     value
         The policy's value as :func:`lmdsl.policy.evaluate` gives it; made where missing.
+    stop
+        Ends the work; what is not established by then is not claimed.
     """
-    witness, V = _first_try(lp, pair, tolerance, value)
+    try:
+        witness, V = _first_try(lp, pair, tolerance, value, stop)
+    except Stopped:
+        witness, V = Witness(pair), None
     proof = check(lp, witness, tolerance)
     if V is not None and (proof.gap is None or proof.gap > tolerance):
-        witness = _tightened(lp, witness, V, tolerance)
+        witness = _tightened(lp, witness, V, tolerance, stop)
         proof = check(lp, witness, tolerance)
     return Verified(proof, witness)
 
 
 def _first_try(
-    lp: StabilizationLP, pair: Pairs, tolerance: float, value: Floats | None
+    lp: StabilizationLP, pair: Pairs, tolerance: float, value: Floats | None, stop: Stop
 ) -> tuple[Witness, Floats | None]:
     """Return vectors that serve as a rule, and the policy's value."""
     under, own = lp.under(pair), np.arange(lp.n)
@@ -72,16 +79,16 @@ def _first_try(
     growing = rows if lp.growth == lp.gamma else None
 
     def bounds_of_cost() -> tuple[Witness, Floats | None]:
-        w, d = policy.stability_vector(under, own, sharp=True, rows=growing)
+        w, d = policy.stability_vector(under, own, sharp=True, stop=stop, rows=growing)
         V = value
         if V is None:
-            V = policy.evaluate(under, own, transient=w is not None, rows=rows)
+            V = policy.evaluate(under, own, transient=w is not None, stop=stop, rows=rows)
         if V is None:
-            return Witness(pair, w, None, lower_vector(lp, None, tolerance), None), None
+            return Witness(pair, w, None, lower_vector(lp, None, tolerance, stop), None), None
         return Witness(pair, w, upper_vector(under, own, V, w, d), _guessed(under, V, tolerance)), V
 
     def measure() -> Floats | None:
-        return _measure_vector(under, rows)
+        return _measure_vector(under, rows, stop)
 
     if value is not None:  # then the measure is finite too
         (witness, V), mu = threads.both(bounds_of_cost, measure, lp.n >= MANY)
@@ -91,31 +98,38 @@ def _first_try(
     return replace(witness, mu=mu), V
 
 
-def _tightened(lp: StabilizationLP, witness: Witness, V: Floats, tolerance: float) -> Witness:
+def _tightened(
+    lp: StabilizationLP, witness: Witness, V: Floats, tolerance: float, stop: Stop
+) -> Witness:
     """Bring the bounds of the cost together, where the first try did not."""
-    pair, V_up, W = witness.pair, witness.V_up, lower_vector(lp, V, tolerance)
+    pair, V_up, W = witness.pair, witness.V_up, lower_vector(lp, V, tolerance, stop)
     assert pair is not None
     best = gap(lp, V_up, W)
     for slack in RELATIVE_SLACK:
         if best <= tolerance:
             break
-        V_up = _lesser(lp, V_up, _upper_with_slack(lp, pair, slack))
-        W = _greater(lp, W, _lower_with_slack(lp, pair, V, slack))
+        try:
+            V_up = _lesser(lp, V_up, _upper_with_slack(lp, pair, slack, stop))
+            W = _greater(lp, W, _lower_with_slack(lp, pair, V, slack, stop))
+        except Stopped:
+            break
         best = gap(lp, V_up, W)
     return replace(witness, V_up=V_up, W=W)
 
 
-def _upper_with_slack(lp: StabilizationLP, pair: Pairs, slack: float) -> Floats | None:
-    V = policy.evaluate(lp, pair, lp.gamma * (1 + slack))
+def _upper_with_slack(lp: StabilizationLP, pair: Pairs, slack: float, stop: Stop) -> Floats | None:
+    V = policy.evaluate(lp, pair, lp.gamma * (1 + slack), stop=stop)
     return V if V is not None and check_upper(lp, pair, V) else None
 
 
-def _lower_with_slack(lp: StabilizationLP, pair: Pairs, V: Floats, slack: float) -> Floats | None:
+def _lower_with_slack(
+    lp: StabilizationLP, pair: Pairs, V: Floats, slack: float, stop: Stop
+) -> Floats | None:
     gamma = lp.gamma * (1 - slack)
-    value = policy.evaluate(lp, pair, gamma, start=V)
+    value = policy.evaluate(lp, pair, gamma, start=V, stop=stop)
     if value is None:
         return None
-    W = policy.iterate(lp, pair, value, gamma, limit=20).value
+    W = policy.iterate(lp, pair, value, gamma, stop=stop, limit=20).value
     return W if check_lower(lp, W) else None
 
 
@@ -150,7 +164,9 @@ def upper_vector(
     return V if check_upper(lp, pair, V) else None
 
 
-def lower_vector(lp: StabilizationLP, V: Floats | None, tolerance: float) -> Floats:
+def lower_vector(
+    lp: StabilizationLP, V: Floats | None, tolerance: float, stop: Stop = never
+) -> Floats:
     """Return W of claim 3, as large as can be proved from V; 0 always serves."""
     zero = np.zeros(lp.n)
     candidates: list[Floats] = []
@@ -159,11 +175,11 @@ def lower_vector(lp: StabilizationLP, V: Floats | None, tolerance: float) -> Flo
         if W is not None:
             return W
         start = V * (1 - min(tolerance, 1e-6) / 4)
-        W = bounds.lower_until_below(lp, start, lp.gamma, lp.cost)
+        W = bounds.lower_until_below(lp, start, lp.gamma, lp.cost, stop=stop)
         if W is not None:
             candidates.append(W)
     if V is None or not candidates or gap(lp, V, candidates[0]) > tolerance:
-        candidates.append(bounds.raise_from_zero(lp, lp.gamma, lp.cost, 2000))
+        candidates.append(bounds.raise_from_zero(lp, lp.gamma, lp.cost, 2000, stop))
     good = [W for W in candidates if check_lower(lp, W)]
     best: Floats = max(good, key=lambda W: weighted(lp, W), default=zero)
     return best
@@ -192,13 +208,13 @@ def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
     return None
 
 
-def _measure_vector(under: StabilizationLP, rows: Peeled) -> Floats | None:
+def _measure_vector(under: StabilizationLP, rows: Peeled, stop: Stop) -> Floats | None:
     def matrix() -> Any:
         return under.gamma * under.rows.matrix()
 
     # The residual counts in absolute terms where mu is small, summed over all cells.
     flat = 1e-2 * MEASURE_TOLERANCE / under.n
-    mu = linear.solve_transposed(rows, under.weight, matrix, flat=flat)
+    mu = linear.solve_transposed(rows, under.weight, matrix, flat=flat, stop=stop)
     if mu is not None and not check_measure(under, np.arange(under.n), mu)[1]:
-        mu = linear.solve_transposed(rows, under.weight, matrix, start=mu)
+        mu = linear.solve_transposed(rows, under.weight, matrix, start=mu, stop=stop)
     return mu

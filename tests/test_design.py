@@ -28,7 +28,7 @@ systems.*
 systems
 declarations
 problem
-sampling memory threads directions
+sampling memory threads directions deadline
 sweeps
 peeling merging leaps
 linear

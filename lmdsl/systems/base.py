@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -21,11 +21,12 @@ from lmdsl.declared import Count, Declared, Formulas, Number, Parameters
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, Formula, parse
 from lmdsl.jets import Jet
-from lmdsl.program import Program
+from lmdsl.program import Check, Program
 from lmdsl.recording import Recorder
 
 Array = NDArray[np.float64]
-Step = Callable[[Mapping[str, Any]], tuple[Array, ...]]
+Step = Callable[..., tuple[Array, ...]]
+"""``step(values, check=None)``: images of named arrays; ``check`` as for a program."""
 
 Substeps = Annotated[Count, Field(le=1000)]
 Duration = Annotated[Number, Field(gt=0)]
@@ -136,12 +137,15 @@ class _RungeKutta:
     def __init__(self, field: Program, states: tuple[str, ...], step: float, substeps: int) -> None:
         self.field, self.states = field, states
         self.substeps, self.h = substeps, step / substeps
-        self.effort = substeps * (4 * field.effort + 14 * len(states))
+        self.effort, self.work = (
+            substeps * (4 * each + 14 * len(states)) for each in (field.effort, field.work)
+        )
 
-    def __call__(self, values: Mapping[str, Any]) -> tuple[Array, ...]:
+    def __call__(self, values: Mapping[str, Any], check: Check | None = None) -> tuple[Array, ...]:
         start = tuple(np.asarray(values[name], float) for name in self.states)
+        field = partial(self.field, check=check)
         with np.errstate(all="ignore"):
-            images: tuple[Array, ...] = self._advance(values, start, self.field)
+            images: tuple[Array, ...] = self._advance(values, start, field)
         return images
 
     @cached_property
@@ -160,11 +164,13 @@ class _RungeKutta:
 
         return tuple(recorder.formula(image) for image in self._advance({}, start, slope))
 
-    def enclose(self, values: Mapping[str, Jet]) -> tuple[Jet, ...]:
+    def enclose(self, values: Mapping[str, Jet], check: Check | None = None) -> tuple[Jet, ...]:
         """Enclose the images and their derivatives on boxes."""
         start = tuple(values[name] for name in self.states)
         with np.errstate(all="ignore"):
-            images: tuple[Jet, ...] = self._advance(values, start, self.field.enclose)
+            images: tuple[Jet, ...] = self._advance(
+                values, start, partial(self.field.enclose, check=check)
+            )
         return images
 
     def _advance(self, values: Mapping[str, Any], state: tuple[Any, ...], field: Any) -> Any:

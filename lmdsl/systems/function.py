@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from lmdsl.errors import BadInput, shown
+from lmdsl.program import Check
 from lmdsl.systems.base import Array, Step, System
 
 WHERE = "system.next"
@@ -59,8 +60,10 @@ class FunctionStep:
     ) -> None:
         self.function, self.states, self.parameters = function, states, parameters
 
-    def __call__(self, values: Mapping[str, Any]) -> tuple[Array, ...]:
+    def __call__(self, values: Mapping[str, Any], check: Check | None = None) -> tuple[Array, ...]:
         """Return the images as new arrays, each of the shape of the arguments it depends on."""
+        if check is not None:
+            check()
         return tuple(np.array(image, dtype=np.float64) for image in self._returned(values))
 
     def _returned(self, values: Mapping[str, Any]) -> list[Any]:
