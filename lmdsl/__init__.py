@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from lmdsl.comparison import compare as compare
     from lmdsl.controller import Controller as Controller
     from lmdsl.controller import Simulation as Simulation
+    from lmdsl.deadline import TimeLimitReached as TimeLimitReached
     from lmdsl.errors import BadInput as BadInput
     from lmdsl.errors import LmdslError as LmdslError
     from lmdsl.explanation import explain as explain
@@ -48,6 +49,7 @@ _HOME = {
     "Result": "result",
     "Simulation": "controller",
     "StabilizationLP": "lp",
+    "TimeLimitReached": "deadline",
     "Verification": "verification",
     "compare": "comparison",
     "compile": "lp",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from lmdsl import boxes, facts, graph
 from lmdsl.boxes import Region
+from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.errors import BadInput, shown
 from lmdsl.facts import NAMES, Why
 from lmdsl.graph import CellStatus
@@ -200,7 +202,7 @@ def explain(
     *,
     regions: int = 8,
     phase_one: bool = False,
-    time_limit: float | None = None,
+    time_limit: float | Deadline | None = None,
     progress: Progress | None = None,
 ) -> Explanation:
     """Explain which cells cannot be stabilized, why, and what would help.
@@ -214,7 +216,7 @@ def explain(
     phase_one
         Solve the phase-one LP: how much mass of which cells cannot be stabilized.
     time_limit
-        Seconds for that LP.
+        Seconds. Hints that were not tried by then are left out.
     progress
         Called with (stage, fraction done, or -1) during long work.
 
@@ -222,9 +224,12 @@ def explain(
     ------
     BadInput
         The problem cannot be compiled, or ``regions`` is not positive.
+    TimeLimitReached
+        The problem was not compiled, or the phase-one LP not solved, in time.
     LmdslError
         The phase-one LP is not solved.
     """
+    deadline = Deadline.of(time_limit)
     if not isinstance(regions, int | np.integer) or regions < 1:
         raise BadInput(f"{shown(regions)} is not a whole number >= 1", "regions")
     assembled = None
@@ -235,10 +240,10 @@ def explain(
         problem = problem.problem
     else:
         partition = Partition.of(problem)
-        assembled = assemble(problem, partition, progress)
-        status = _status(partition, assembled)
+        assembled = assemble(problem, partition, progress, deadline)
+        status = _status(partition, assembled, deadline)
     if phase_one and assembled is None:
-        assembled = assemble(problem, partition, progress)
+        assembled = assemble(problem, partition, progress, deadline)
     if progress:
         progress("explain", -1.0)
     found = []
@@ -251,12 +256,14 @@ def explain(
             found.append(Cause(NAMES[code], cells, parts, cells - inside))
     solved = None
     if phase_one and assembled is not None:
-        solved = PhaseOne.of(partition, assembled, status, problem.gamma, time_limit)
-    helpful = hints(Sampler(problem, partition), status)
+        solved = PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
+    helpful: tuple[Hint, ...] = ()
+    with suppress(TimeLimitReached):
+        helpful = hints(Sampler(problem, partition, deadline, "trying what helps"), status)
     return Explanation(problem, partition, status, tuple(found), helpful, solved, assembled)
 
 
-def phase_one(problem: Problem, time_limit: float | None = None) -> PhaseOne:
+def phase_one(problem: Problem, time_limit: float | Deadline | None = None) -> PhaseOne:
     """Solve the phase-one LP of a problem; see :mod:`lmdsl.phase_one` for what it says.
 
     Parameters
@@ -264,22 +271,26 @@ def phase_one(problem: Problem, time_limit: float | None = None) -> PhaseOne:
     problem
         A problem.
     time_limit
-        Seconds for the LP.
+        Seconds.
 
     Raises
     ------
+    TimeLimitReached
+        The time limit was reached.
     LmdslError
         The LP is not solved.
     """
-    partition = Partition.of(problem)
-    assembled = assemble(problem, partition)
-    status = _status(partition, assembled)
-    return PhaseOne.of(partition, assembled, status, problem.gamma, time_limit)
+    partition, deadline = Partition.of(problem), Deadline.of(time_limit)
+    assembled = assemble(problem, partition, deadline=deadline)
+    status = _status(partition, assembled, deadline)
+    return PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
 
 
-def _status(partition: Partition, transitions: Transitions) -> NDArray[np.uint8]:
+def _status(
+    partition: Partition, transitions: Transitions, deadline: Deadline
+) -> NDArray[np.uint8]:
     """Return the status of every cell, shape (N,)."""
-    found = graph.stabilizable(transitions.pair_pointer, transitions.rows)
+    found = graph.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
     status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)
     status[transitions.regions.free] = graph.causes(found, transitions.pair_pointer)
     status[transitions.regions.attractor] = CellStatus.ATTRACTOR

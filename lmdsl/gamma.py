@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from lmdsl import bounds, feasibility, growth, policy
 from lmdsl.boxes import Area
+from lmdsl.deadline import Deadline
 from lmdsl.graph import CellStatus
 from lmdsl.growth import Growth
 from lmdsl.linear import Stop, Stopped, never
@@ -126,7 +127,11 @@ CORNER = (
 )
 
 
-def gamma_max(problem: Problem | StabilizationLP, progress: Progress | None = None) -> GammaBar:
+def gamma_max(
+    problem: Problem | StabilizationLP,
+    progress: Progress | None = None,
+    time_limit: float | Deadline | None = None,
+) -> GammaBar:
     """Enclose the largest feasible gamma of a problem.
 
     Parameters
@@ -135,6 +140,8 @@ def gamma_max(problem: Problem | StabilizationLP, progress: Progress | None = No
         A problem, or its compiled LP; its own gamma plays no part.
     progress
         Called with (stage, fraction done, or -1).
+    time_limit
+        Seconds; then the bracket is as tight as it was made by then.
 
     Returns
     -------
@@ -146,11 +153,14 @@ def gamma_max(problem: Problem | StabilizationLP, progress: Progress | None = No
     ------
     BadInput
         The problem cannot be compiled.
+    TimeLimitReached
+        It was not compiled in time.
     """
-    lp = compile(problem, progress) if isinstance(problem, Problem) else problem
+    deadline = Deadline.of(time_limit)
+    lp = compile(problem, progress, deadline) if isinstance(problem, Problem) else problem
     if progress:
         progress("gamma-max", -1.0)
-    return bracket(lp)
+    return bracket(lp, deadline)
 
 
 def bracket(lp: StabilizationLP, stop: Stop = never, limit: int = 60) -> GammaBar:

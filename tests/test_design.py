@@ -78,9 +78,9 @@ __main__
 
 PUBLIC = [
     "BadInput", "CellStatus", "Certificate", "Comparison", "Controller", "GammaBar",
-    "LmdslError", "Problem", "Result", "Simulation", "StabilizationLP", "Verification",
-    "__version__", "backends", "compare", "compile", "explain", "exports", "gamma_max", "load",
-    "plotting", "solve", "systems", "testing", "verify",
+    "LmdslError", "Problem", "Result", "Simulation", "StabilizationLP", "TimeLimitReached",
+    "Verification", "__version__", "backends", "compare", "compile", "explain", "exports",
+    "gamma_max", "load", "plotting", "solve", "systems", "testing", "verify",
 ]  # fmt: skip
 
 # Imports inside functions against the order, each with its reason.

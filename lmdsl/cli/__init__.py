@@ -16,6 +16,7 @@ from typing import Any
 
 from lmdsl.cli import feasibility, listing, results, solving
 from lmdsl.cli.output import Arguments, Run, print_json
+from lmdsl.deadline import TimeLimitReached
 from lmdsl.errors import LmdslError, shown
 
 
@@ -40,6 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _fail("interrupted", 130)
     except MemoryError:
         return _bad(parsed, "out of memory; use fewer cells, controls or sample points")
+    except TimeLimitReached as error:
+        return _bad(parsed, str(error), "solver_failed", 4)
     except LmdslError as error:
         return _bad(parsed, str(error))
     except Exception as error:
@@ -54,17 +57,17 @@ def _fail(message: str, status: int) -> int:
     return status
 
 
-def _bad(parsed: Arguments, message: str) -> int:
+def _bad(parsed: Arguments, message: str, status: str = "bad_input", exit_status: int = 2) -> int:
     if getattr(parsed, "json", False):
         from lmdsl.result import Report
 
-        report: dict[str, Any] = Report(status="bad_input", message=message).to_dict()
+        report: dict[str, Any] = Report(status=status, message=message).to_dict()
         if parsed.command == "compare":
             report = {"results": [report], "agreement": None}
         elif parsed.command != "solve":
-            report = {"status": "bad_input", "message": message}
+            report = {"status": status, "message": message}
         print_json(report)
-    return _fail(message, 2)
+    return _fail(message, exit_status)
 
 
 def _parser() -> argparse.ArgumentParser:

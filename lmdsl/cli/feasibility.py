@@ -9,6 +9,7 @@ def add(command: Command) -> None:
     """Add the commands of this module."""
     limit = command("gamma-max", _gamma_max, "Enclose the largest feasible gamma.")
     limit.add_argument("file", metavar="FILE", help="problem file")
+    limit.add_argument("--time-limit", type=float, metavar="S", help="seconds")
     as_json(limit)
 
     explain = command("explain", _explain, "Say which cells cannot be stabilized, why, and what "
@@ -16,7 +17,7 @@ def add(command: Command) -> None:
     explain.add_argument("file", metavar="FILE", help="problem file")
     explain.add_argument("--phase-one", action="store_true",
                          help="phase-one LP: how much mass cannot be stabilized")  # fmt: skip
-    explain.add_argument("--time-limit", type=float, metavar="S", help="seconds for that LP")
+    explain.add_argument("--time-limit", type=float, metavar="S", help="seconds")
     as_json(explain)
 
 
@@ -26,7 +27,7 @@ def _gamma_max(parsed: Arguments) -> int:
 
     problem = load(parsed.file)
     with Progress() as progress:
-        found = gamma_max(problem, progress)
+        found = gamma_max(problem, progress, parsed.time_limit)
     if parsed.json:
         print_json(found.to_dict())
     else:

@@ -34,7 +34,9 @@ def _problem_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--gamma", type=float, metavar="G", help="override gamma")
     sub.add_argument("--tolerance", type=float, default=1e-6, metavar="T",
                      help="largest gap that counts as verified (default 1e-6)")  # fmt: skip
-    sub.add_argument("--time-limit", type=float, metavar="S", help="seconds for the backend")
+    sub.add_argument(
+        "--time-limit", type=float, metavar="S", help="seconds for compiling and solving"
+    )
 
 
 def _problem(parsed: Arguments) -> Any:
@@ -64,13 +66,14 @@ def _solve(parsed: Arguments) -> int:
             progress=progress,
         )
     parsed.status = result.exit_status
-    if parsed.out is not None:
+    saved = parsed.out is not None and result.lp is not None  # else there was no time to compile
+    if saved:
         result.save(parsed.out)
     if parsed.json:
         print_json(result.to_dict())
     else:
         print(_summary(result))
-        if parsed.out is not None:
+        if saved:
             print(f"written to {safe(parsed.out)}")
     return result.exit_status
 
@@ -110,7 +113,9 @@ def _summary(result: Any) -> str:
         ("pairs", f"{result.pairs} surviving, {result.controls} controls"),
         ("gamma", f"{result.gamma!r}"),
     ]  # fmt: skip
-    if result.status != "not_stabilizable":
+    if result.lp is None:  # there was no time to compile
+        rows[3:5] = [("cells", str(result.cells)), ("controls", str(result.controls))]
+    elif result.status != "not_stabilizable":
         rows += [
             ("cost", f"{number(result.cost)} (lower bound {number(result.lower_bound)})"),
             ("gap", f"{number(result.gap, '.2g')} (tolerance {number(result.tolerance, '.2g')})"),
