@@ -26,7 +26,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import boxes, memory
+from lmdsl import apart, boxes, linprog, memory
+from lmdsl.deadline import Deadline
 from lmdsl.errors import LmdslError, shown
 from lmdsl.facts import NAMES
 from lmdsl.graph import CellStatus, owner
@@ -34,7 +35,7 @@ from lmdsl.partition import Partition
 from lmdsl.transitions import Transitions
 
 Floats = NDArray[np.float64]
-TIGHT, SMALL = 1e-9, 1e-6
+SMALL = 1e-6
 MOST_CELLS = 100
 BYTES = 150
 """Bytes per entry of the LP: SciPy's copies and the factors of HiGHS, roughly."""
@@ -77,16 +78,17 @@ class PhaseOne:
         transitions: Transitions,
         status: NDArray[np.uint8],
         gamma: float,
-        time_limit: float | None = None,
+        deadline: Deadline | None = None,
     ) -> PhaseOne:
         """Solve the LP with HiGHS (interior point, then crossover).
 
         Raises
         ------
+        TimeLimitReached
+            The deadline has passed.
         LmdslError
-            HiGHS does not solve it, for instance within the time limit.
+            HiGHS does not solve it.
         """
-        from scipy.optimize import linprog
         from scipy.sparse import csr_array, eye_array, hstack
 
         rows, pointer = transitions.rows, transitions.pair_pointer
@@ -102,23 +104,20 @@ class PhaseOne:
         price = np.concatenate([np.zeros(K), np.ones(2 * F)])
         # The weights are scaled to 1 so that the solver's tolerances mean the same for every F.
         scale = max(int((weight > 0).sum()), 1)
-        options = {"primal_feasibility_tolerance": TIGHT, "dual_feasibility_tolerance": TIGHT}
-        if time_limit is not None:
-            options["time_limit"] = time_limit
-        solver: Any = linprog
-        found = solver(
-            price,
-            A_eq=hstack([B, eye_array(F), -eye_array(F)], format="csc"),
-            b_eq=weight * scale,
-            method="highs-ipm",
-            options=options,
-        )
-        if found.status != 0 or found.x is None:
-            raise LmdslError(f"the phase-one LP was not solved: {shown(str(found.message), 200)}")
-        theta = np.maximum(found.x[:K], 0.0) / scale
+        deadline, doing = Deadline.of(deadline), "solving the phase-one LP"
+        deadline.check(doing)
+        matrix = hstack([B, eye_array(F), -eye_array(F)], format="csc")
+        x, marginals, failed = apart.call(
+            linprog.solved, price, matrix, weight * scale, deadline.left,
+            deadline=deadline, doing=doing,
+        )  # fmt: skip
+        if failed:
+            deadline.check(doing)
+            raise LmdslError(f"the phase-one LP was not solved: {shown(failed, 200)}")
+        theta = np.maximum(x[:K], 0.0) / scale
         residual = weight - B @ theta
         residual[np.abs(residual) <= SMALL / scale] = 0.0
-        share = np.clip(found.eqlin.marginals, 0.0, 1.0)
+        share = np.clip(marginals, 0.0, 1.0)
         share[share <= SMALL] = 0.0
         total = float(np.abs(residual).sum())
         return cls(partition, cells, status[cells], weight, residual, weight * share, total)

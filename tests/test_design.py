@@ -29,6 +29,7 @@ systems
 declarations
 problem
 sampling memory threads directions deadline
+apart linprog
 sweeps
 peeling merging leaps
 linear
