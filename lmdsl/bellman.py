@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import threads
+from lmdsl.kernels import kernel
 from lmdsl.lp import StabilizationLP
 from lmdsl.sweeps import ONE
 
@@ -136,7 +136,7 @@ def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDAr
     return below(lp, V, best + tolerance * np.abs(best))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _improve(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, value, pair
 ):
@@ -152,7 +152,7 @@ def _improve(  # type: ignore[no-untyped-def]
         value[i], pair[i] = best, choice
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _below(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, limit, found
 ):
@@ -164,7 +164,7 @@ def _below(  # type: ignore[no-untyped-def]
             found[k] = gamma * q + cost[k] <= limit[i]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rise(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, gamma, V, backwards, value, pair
 ):

@@ -14,10 +14,10 @@ import math
 from fractions import Fraction
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl.bellman import over_cells, padded
+from lmdsl.kernels import kernel
 from lmdsl.linear import Stop, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.sweeps import ONE
@@ -272,12 +272,12 @@ def worst_excess(lp: StabilizationLP, V: Floats) -> tuple[float, bool]:
     return max(worst for worst, _ in found), any(stuck for _, stuck in found)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _relative(entries):  # type: ignore[no-untyped-def]
     return (np.float64(entries) + 8.0) * UNIT
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def]
     """The sum (P V)_k, its relative and its absolute rounding error.
 
@@ -295,7 +295,7 @@ def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def
     return q, _relative(entries), absolute
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _careful(k, pointer, target, code, share, gamma, g, V):  # type: ignore[no-untyped-def]
     """A lower bound of gamma (P V)_k + g that minds underflow."""
     q, relative, absolute = _product(k, pointer, target, code, share, V)
@@ -305,7 +305,7 @@ def _careful(k, pointer, target, code, share, gamma, g, V):  # type: ignore[no-u
     return max((future + g) * (1.0 - 4.0 * UNIT) - 2.0 * LEAST, g)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: ignore[no-untyped-def]
     """A lower bound of gamma (P V)_k + g; ``plain`` where no product underflows."""
     q = 0.0
@@ -316,7 +316,7 @@ def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: 
     return below if plain else _careful(k, pointer, target, code, share, gamma, g, V)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _inflow(pair, pointer, target, code, share, gamma, mu, total, entries):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(pair))):
         k = pair[i]
@@ -325,7 +325,7 @@ def _inflow(pair, pointer, target, code, share, gamma, mu, total, entries):  # t
             entries[target[e]] += 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _above(first, last, pair, pointer, target, code, share, gamma, V, plain, upper):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(first), np.uint64(last)):
         k = pair[i]
@@ -344,7 +344,7 @@ def _above(first, last, pair, pointer, target, code, share, gamma, V, plain, upp
             upper[i] = future * (1.0 + 4.0 * UNIT) + 2.0 * LEAST
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _below(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain, lower
 ):
@@ -358,7 +358,7 @@ def _below(  # type: ignore[no-untyped-def]
         lower[i] = best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _open(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain, found
 ):
@@ -379,7 +379,7 @@ def _open(  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _excess(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain
 ):

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from lmdsl.kernels import kernel
 from lmdsl.partition import EDGE, Partition
 
 Ends = dict[str, tuple[float, float]]
@@ -155,7 +155,7 @@ def _region(
     return Region(ends(partition, first, count), int(np.prod(count)), middle)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _room(left, room, shape, stride, periodic):  # type: ignore[no-untyped-def]
     """Multiply room by the width, on every axis, of the widest symmetric run around a cell."""
     N = len(left)
@@ -178,7 +178,7 @@ def _room(left, room, shape, stride, periodic):  # type: ignore[no-untyped-def]
                         room[start + i * s] *= max(min(width, n), 0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grow(left, shape, stride, periodic, first, count):  # type: ignore[no-untyped-def]
     """Grow a box until every face is blocked, and take its cells out of ``left``.
 
@@ -207,7 +207,7 @@ def _grow(left, shape, stride, periodic, first, count):  # type: ignore[no-untyp
         _layer(left, shape, stride, first, count, 0, at % shape[0], True)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _layer(left, shape, stride, first, count, axis, at, take=False):  # type: ignore[no-untyped-def]
     """Say whether a layer of the box at a place of an axis is all there; or take it out."""
     d = len(shape)

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import boxes
 from lmdsl.boxes import Ends, Region
 from lmdsl.graph import CellStatus
+from lmdsl.kernels import kernel
 from lmdsl.partition import Partition
 from lmdsl.result import jsonable
 from lmdsl.rows import Rows
@@ -217,7 +217,7 @@ def reachable(pair_pointer: NDArray[np.int64], rows: Rows, start: int) -> NDArra
     return seen[:-1]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _reach(pair_pointer, pointer, target, start, seen):  # type: ignore[no-untyped-def]
     queue = np.empty(len(seen), dtype=np.int64)
     queue[0], end, at = start, 1, 0

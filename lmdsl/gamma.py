@@ -25,7 +25,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bounds, feasibility, growth, policy
@@ -33,6 +32,7 @@ from lmdsl.boxes import Area
 from lmdsl.deadline import Deadline
 from lmdsl.graph import CellStatus
 from lmdsl.growth import Growth
+from lmdsl.kernels import kernel
 from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
@@ -405,7 +405,7 @@ def restricted(lp: StabilizationLP, w: Floats) -> StabilizationLP | None:
     return replace(smaller, cell_status=status, weight=weight)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sure_levels(before_pointer, before_pair, pointer, target, cell, pair):  # type: ignore[no-untyped-def]
     """Peel off cells with a pair all of whose successors are in A or peeled off before."""
     n = len(pair)

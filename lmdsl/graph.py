@@ -23,11 +23,11 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numba import njit, types
 from numpy.typing import NDArray
 
 from lmdsl import threads
 from lmdsl.deadline import Deadline
+from lmdsl.kernels import fixed, kernel
 from lmdsl.rows import Rows
 from lmdsl.sweeps import ONE
 from lmdsl.transitions import Transitions
@@ -182,12 +182,11 @@ def _tree(
     left = 0 if before else PATIENCE * len(rows.target)
     below = 0
 
-    pairs, all_alive = pair_pointer.view(np.uint64), bool(alive.all())
+    model = [fixed(a) for a in (pair_pointer.view(np.uint64), *rows.kernel[:2], alive, front)]
+    all_alive = bool(alive.all())
 
     def sweep(span: tuple[int, int]) -> int:
-        return int(
-            _sweep(pairs, *rows.kernel[:2], alive, all_alive, front, below, level, pair, *span)
-        )
+        return int(_sweep(*model, all_alive, below, level, pair, *span))
 
     while left > 0 and front.any():
         left -= sum(threads.each(sweep, spans))
@@ -236,7 +235,7 @@ def owner(pair_pointer: NDArray[np.int64]) -> NDArray[np.int32]:
     return np.repeat(np.arange(len(pair_pointer) - 1, dtype=np.int32), np.diff(pair_pointer))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _transpose(pointer, target, out_pointer, pair):  # type: ignore[no-untyped-def]
     for e in range(len(target)):
         out_pointer[target[e] + 1] += 1
@@ -250,26 +249,14 @@ def _transpose(pointer, target, out_pointer, pair):  # type: ignore[no-untyped-d
             position[j] += 1
 
 
-_POINTER = types.Array(types.uint64, 1, "C", readonly=True)
-_TARGET = types.Array(types.uint32, 1, "C", readonly=True)
-_MASK = types.Array(types.boolean, 1, "C", readonly=True)
-
-
-@njit(
-    types.uint64(
-        _POINTER, _POINTER, _TARGET, _MASK, types.boolean, _MASK,
-        types.int64, types.int32[::1], types.int64[::1], types.uint64, types.uint64,
-    ),
-    cache=True,
-    nogil=True,
-)  # fmt: skip
-def _sweep(pair_pointer, pointer, target, alive, all_alive, front, below, level, pair, first, last):  # type: ignore[no-untyped-def]
+@kernel
+def _sweep(pair_pointer, pointer, target, alive, front, all_alive, below, level, pair, first, last):  # type: ignore[no-untyped-def]
     """Put on level ``below + 1`` the cells first..last-1 without level that can enter the front.
 
     Returns the number of entries visited. ``front`` is the cells on level ``below``.
     """
     visits = np.uint64(0)
-    for i in range(first, last):
+    for i in range(np.uint64(first), np.uint64(last)):
         if level[i] >= 0:
             continue
         begin, end = pair_pointer[i], pair_pointer[i + ONE]
@@ -293,7 +280,7 @@ def _sweep(pair_pointer, pointer, target, alive, all_alive, front, below, level,
     return visits
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _search(pointer, before, cell, alive, start, level, pair):  # type: ignore[no-untyped-def]
     """Breadth-first search from the cells of the highest level so far, over predecessors."""
     queue = np.empty(len(level), dtype=np.int64)
@@ -314,7 +301,7 @@ def _search(pointer, before, cell, alive, start, level, pair):  # type: ignore[n
                     pair[i] = k
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _remove(lost, pointer, pair, cell, pair_pointer, alive, inside, choices):  # type: ignore[no-untyped-def]
     """Remove cells, the pairs that can reach them, and cells left without a pair."""
     queue = np.empty(len(inside), dtype=np.int64)
@@ -341,7 +328,7 @@ def _remove(lost, pointer, pair, cell, pair_pointer, alive, inside, choices):  #
                     end += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _ends(kept, pointer, ends):  # type: ignore[no-untyped-def]
     """Write the ends of the rows that are kept, one after the other; return the last."""
     row = end = 0
@@ -352,7 +339,7 @@ def _ends(kept, pointer, ends):  # type: ignore[no-untyped-def]
     return end
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _keep(kept, pointer, target, code, renumber, new_target, new_code):  # type: ignore[no-untyped-def]
     """Copy the rows that are kept, their targets renumbered."""
     at = 0

@@ -14,10 +14,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bounds, linear
+from lmdsl.kernels import kernel
 from lmdsl.linear import Stop, never
 from lmdsl.lp import StabilizationLP
 
@@ -175,7 +175,7 @@ def check_low(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
     return float(ratio.min()) * (1 - 4 * bounds.UNIT)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _scale(indptr, indices, data, order, ends, x, bound, w):  # type: ignore[no-untyped-def]
     """Scale the vector of each class so that P w <= bound w; False where doubles end.
 

@@ -7,9 +7,9 @@ as every component allows: down to just above the solution of x = b + M x, or up
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from lmdsl.kernels import kernel
 from lmdsl.sweeps import CEILING, System
 
 Floats = NDArray[np.float64]
@@ -73,7 +73,7 @@ def _moved(system: System, v: Floats) -> Floats:
     return system.inverse * out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _off_diagonal(begin, end, indices, data, v, out):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(len(begin))):
         y = 0.0

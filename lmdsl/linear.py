@@ -19,10 +19,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import leaps
+from lmdsl.kernels import kernel
 from lmdsl.peeling import Peeled
 from lmdsl.sweeps import CEILING, NEVER, TOLERANCE, System
 
@@ -384,7 +384,7 @@ def _dense(inner: Any) -> Callable[[Floats], Floats]:
     return lambda known: np.linalg.solve(system, known)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _spread(begin, end, indices, marked):  # type: ignore[no-untyped-def]
     """Mark everything that can reach a marked node."""
     queue = np.flatnonzero(marked)
@@ -402,7 +402,7 @@ def _spread(begin, end, indices, marked):  # type: ignore[no-untyped-def]
                 last += 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _topological(indptr, indices, label, count):  # type: ignore[no-untyped-def]
     """Rank the classes so that every class comes after all it leads to (Kahn's algorithm)."""
     waits = np.zeros(count, dtype=np.int64)
@@ -440,7 +440,7 @@ def _topological(indptr, indices, label, count):  # type: ignore[no-untyped-def]
     return rank
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _substitute(indptr, indices, data, cells, b, x):  # type: ignore[no-untyped-def]
     """Solve single-cell classes in order; False where staying alone already diverges."""
     for i in cells:

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl.formulas import PLAIN
+from lmdsl.kernels import kernel
 from lmdsl.merging import add_cost, settle_cost
 from lmdsl.partition import Axis, circle, interval
 from lmdsl.program import Instruction, Program
@@ -214,7 +214,7 @@ def _placed(
     return tape, rows
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _run(  # type: ignore[no-untyped-def]
     long, tape, constants, rows, inputs, flat, start, stride, first, points, nodes, last,
     located, axes, clip, index, paid, weights, mean,
@@ -264,7 +264,7 @@ def _run(  # type: ignore[no-untyped-def]
         settle_cost(mean[i], least[i], total)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _load(flat, at, step, line):  # type: ignore[no-untyped-def]
     if step == 0:
         line[:] = flat[at]
@@ -273,7 +273,7 @@ def _load(flat, at, step, line):  # type: ignore[no-untyped-def]
             line[j] = flat[at + j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _locate(image, axis, clip, index):  # type: ignore[no-untyped-def]
     """Add the indices on one axis; ``axis`` has the fields of :class:`lmdsl.partition.Axis`."""
     low, high, width, cells, stride = axis[0], axis[1], axis[2], axis[3], axis[4]
@@ -283,7 +283,7 @@ def _locate(image, axis, clip, index):  # type: ignore[no-untyped-def]
         interval(image, low, high, width, cells, stride, clip, index)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _compute(tape, work, n):  # type: ignore[no-untyped-def]
     """Do the instructions on the first n samples of all rows."""
     for t in range(len(tape)):

@@ -7,12 +7,12 @@ samples alike (sorting, summing the cost) run on vectors of pairs.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, types
 
+from lmdsl.kernels import kernel
 from lmdsl.sweeps import ONE
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def merge(  # type: ignore[no-untyped-def]
     index, cells_last, mean, number, group, bits, first_code, key,
     per_cell, control, cost, end, target, code,
@@ -68,7 +68,7 @@ def merge(  # type: ignore[no-untyped-def]
     return pairs, entries
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tile(cells_last, controls):  # type: ignore[no-untyped-def]
     """Return how many cells and controls are sorted at a time.
 
@@ -77,7 +77,7 @@ def tile(cells_last, controls):  # type: ignore[no-untyped-def]
     return (8, controls) if cells_last else (1, min(64, controls))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _keys(index, cells_last, c0, c1, a0, a1, number, group, bits, key):  # type: ignore[no-untyped-def]
     """Gather ``target << bits | group`` of every sample of a tile, columns by cell and control.
 
@@ -94,7 +94,7 @@ def _keys(index, cells_last, c0, c1, a0, a1, number, group, bits, key):  # type:
                 _gather(index[c, s, a0:a1], number, group[s], bits, key[s, (c - c0) * wide :])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather(line, number, group, bits, key):  # type: ignore[no-untyped-def]
     for i in range(len(line)):
         inside = line[i] >= 0.0
@@ -102,7 +102,7 @@ def _gather(line, number, group, bits, key):  # type: ignore[no-untyped-def]
         key[i] = ((t if inside else -1) << bits) | group
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sort(key, count):  # type: ignore[no-untyped-def]
     """Sort each of the first columns by Batcher's merge exchange.
 
@@ -124,7 +124,7 @@ def _sort(key, count):  # type: ignore[no-untyped-def]
         p //= 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _exchange(low, high, count):  # type: ignore[no-untyped-def]
     for i in range(count):
         a, b = low[i], high[i]
@@ -132,7 +132,7 @@ def _exchange(low, high, count):  # type: ignore[no-untyped-def]
         high[i] = b if a < b else a
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _row(key, k, bits, first_code, entries, target, code):  # type: ignore[no-untyped-def]
     """Append one entry per distinct key of column k; return the new number of entries.
 
@@ -152,7 +152,7 @@ def _row(key, k, bits, first_code, entries, target, code):  # type: ignore[no-un
     return entries + ONE
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_cost(cost, weight, mean, least):  # type: ignore[no-untyped-def]
     """Add the cost of one sample to its pairs, and note the least."""
     for j in range(len(mean)):
@@ -160,7 +160,7 @@ def add_cost(cost, weight, mean, least):  # type: ignore[no-untyped-def]
         mean[j] += weight * cost[j]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def settle_cost(mean, least, total):  # type: ignore[no-untyped-def]
     """Turn sums into means, NaN where a sample was negative or not finite."""
     for j in range(len(mean)):
@@ -168,17 +168,7 @@ def settle_cost(mean, least, total):  # type: ignore[no-untyped-def]
         mean[j] = g if (least[j] >= 0.0) & (g < np.inf) else np.nan
 
 
-@njit(
-    types.void(
-        types.Array(types.float64, 4, "C", readonly=True),
-        types.int64,
-        types.float64[::1],
-        types.float64[:, ::1],
-    ),
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-)
+@kernel(error_model="numpy")
 def mean_cost(cost, points, weights, mean):  # type: ignore[no-untyped-def]
     """Average the stage cost over points and nodes, NaN where a sample is negative or not finite.
 

@@ -15,11 +15,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
 from numpy.typing import NDArray
 
 from lmdsl.errors import BadInput
 from lmdsl.frozen import Frozen
+from lmdsl.kernels import fixed, kernel
 from lmdsl.problem import Problem
 
 EDGE = 1e-9
@@ -242,10 +242,6 @@ def _units(x: float, low: float, width: float) -> float:
         return float((x - low) / width)
 
 
-_IMAGE = types.Array(types.float64, 1, "C", readonly=True)
-_F, _OUT = types.float64, types.float64[::1]
-
-
 class Axis(NamedTuple):
     """One axis in plain numbers; ``stride`` cells of the box lie between neighbours on it."""
 
@@ -262,7 +258,7 @@ class Axis(NamedTuple):
         Without a total it is a new array in the shape of the image.
         """
         found = np.zeros(image.shape) if total is None else total
-        flat, line = np.ascontiguousarray(image).reshape(-1), found.reshape(-1)
+        flat, line = fixed(np.ascontiguousarray(image).reshape(-1)), found.reshape(-1)
         if self.periodic:
             circle(flat, self.low, self.width, self.cells, self.stride, line)
         else:
@@ -271,9 +267,7 @@ class Axis(NamedTuple):
 
 
 # The two kernels have no branch in the loop, so that they run on vectors of doubles.
-@njit(
-    types.void(_IMAGE, _F, _F, _F, _F, _OUT), cache=True, nogil=True, error_model="numpy"
-)  # division by zero cannot occur, and its test would be a branch
+@kernel(error_model="numpy")  # division by zero cannot occur, and its test would be a branch
 def circle(image, low, width, cells, stride, index):  # type: ignore[no-untyped-def]
     """Add stride (k mod cells), k = floor((x - low)/width + EDGE); NaN where k is not finite.
 
@@ -297,12 +291,7 @@ def circle(image, low, width, cells, stride, index):  # type: ignore[no-untyped-
                 index[i] += stride * (k % cells) if np.isfinite(k) else np.nan
 
 
-@njit(
-    types.void(_IMAGE, _F, _F, _F, _F, _F, types.boolean, _OUT),
-    cache=True,
-    nogil=True,
-    error_model="numpy",
-)
+@kernel(error_model="numpy")
 def interval(image, low, high, width, cells, stride, clip, index):  # type: ignore[no-untyped-def]
     """Add stride k, k = floor((x - low)/width + EDGE), for 0 <= k < cells; NaN elsewhere.
 

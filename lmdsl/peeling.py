@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import threads
+from lmdsl.kernels import kernel
 from lmdsl.sweeps import CEILING, NEVER, ONE, System
 
 Floats = NDArray[np.float64]
@@ -131,7 +131,7 @@ class Peeled:
         return bool(_down(self.order, s.begin, s.end, s.indices, s.data, s.inverse, x))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _peel(begin, end, indices, order, ends):  # type: ignore[no-untyped-def]
     """Order the cells outside the core, then those in it; return how many are outside, and levels.
 
@@ -184,7 +184,7 @@ def _peel(begin, end, indices, order, ends):  # type: ignore[no-untyped-def]
     return outside, levels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _take(core, begin, end, indices, data, number, out_indices, out_data):  # type: ignore[no-untyped-def]
     used = np.uint64(0)
     for r in range(np.uint64(len(core))):
@@ -194,7 +194,7 @@ def _take(core, begin, end, indices, data, number, out_indices, out_data):  # ty
             used += ONE
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _back(order, begin, end, indices, data, inverse, b, x):  # type: ignore[no-untyped-def]
     last = np.uint64(len(order))
     for t in range(last):
@@ -210,7 +210,7 @@ def _back(order, begin, end, indices, data, inverse, b, x):  # type: ignore[no-u
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _down(order, begin, end, indices, data, inverse, x):  # type: ignore[no-untyped-def]
     for t in range(np.uint64(len(order))):
         i = order[t]

@@ -14,10 +14,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bellman, bounds, graph, leaps, linear
+from lmdsl.kernels import kernel
 from lmdsl.linear import Stop as Stop
 from lmdsl.linear import Stopped, never
 from lmdsl.lp import StabilizationLP
@@ -90,7 +90,7 @@ def reaches_attractor(lp: StabilizationLP, pair: Pairs) -> Bools:
     return reaches[:-1]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _reach(pair, pointer, target, reaches, sweeps):  # type: ignore[no-untyped-def]
     """Mark cells with a marked successor until nothing changes; False where sweeps run out."""
     n = np.uint64(len(pair))

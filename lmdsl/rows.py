@@ -17,12 +17,12 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import threads
 from lmdsl.directions import Directions
 from lmdsl.frozen import Frozen
+from lmdsl.kernels import kernel
 from lmdsl.sampling import Nodes
 from lmdsl.sweeps import NEVER, ONE, System
 
@@ -234,7 +234,7 @@ def _spans(count: int) -> list[tuple[int, int]]:
     return threads.ranges(count, PARTS if count >= MANY else 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _take(first, last, rows, pointer, target, code, out_pointer, out_target, out_code):  # type: ignore[no-untyped-def]
     for r in range(np.uint64(first), np.uint64(last)):
         shift = np.uint64(out_pointer[r]) - pointer[rows[r]]
@@ -243,13 +243,13 @@ def _take(first, last, rows, pointer, target, code, out_pointer, out_target, out
             out_code[e + shift] = code[e]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _lengths(first, last, rows, pointer, length):  # type: ignore[no-untyped-def]
     for r in range(np.uint64(first), np.uint64(last)):
         length[r] = pointer[rows[r] + ONE] - pointer[rows[r]]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _longest(first, last, pair_pointer, pointer, room):  # type: ignore[no-untyped-def]
     """Find the largest number of entries among the rows of each cell."""
     for i in range(np.uint64(first), np.uint64(last)):
@@ -259,7 +259,7 @@ def _longest(first, last, pair_pointer, pointer, room):  # type: ignore[no-untyp
         room[i] = most
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill(  # type: ignore[no-untyped-def]
     first, last, rows, before, pointer, target, code, share, columns, gamma, begin, end, indices,
     data, inverse,
@@ -273,7 +273,7 @@ def _fill(  # type: ignore[no-untyped-def]
             )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def copy_row(  # type: ignore[no-untyped-def]
     r, k, pointer, target, code, share, columns, gamma, begin, end, indices, data, inverse
 ):
@@ -291,7 +291,7 @@ def copy_row(  # type: ignore[no-untyped-def]
     end[r] = used
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather(rows, pointer, target, code, share, columns, indptr, indices, data):  # type: ignore[no-untyped-def]
     """Copy rows without the attractor's share into the arrays of a CSR matrix."""
     used = np.uint64(0)

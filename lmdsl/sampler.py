@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from lmdsl import sampling
 from lmdsl.deadline import Deadline
+from lmdsl.kernels import fixed
 from lmdsl.lines import Lines
 from lmdsl.merging import mean_cost
 from lmdsl.partition import Partition
@@ -188,7 +189,7 @@ class Sampler:
         if cost.ndim < 4:
             cost = cost.reshape((1,) * (4 - cost.ndim) + cost.shape)
         mean = np.zeros((cost.shape[0], cost.shape[3]))
-        mean_cost(cost, len(self.points), self.nodes.weights, mean)
+        mean_cost(fixed(cost), len(self.points), self.nodes.weights, mean)
         return mean
 
 

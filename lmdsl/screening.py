@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import bellman
+from lmdsl.kernels import kernel
 from lmdsl.lp import StabilizationLP
 from lmdsl.rows import Slots, copy_row
 from lmdsl.sweeps import ONE
@@ -161,7 +161,7 @@ class Screen:
             self.scale = 1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _least_ratio(before, after):  # type: ignore[no-untyped-def]
     """The smallest after / before where ``before`` is positive, at most 1."""
     ratio = 1.0
@@ -171,7 +171,7 @@ def _least_ratio(before, after):  # type: ignore[no-untyped-def]
     return ratio
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pass(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, cost, V, pair, margin, scale, backwards, rival, value, new, paid,
     held, pointer, target, code, share, columns, gamma, begins, ends, indices, data, inverse,
@@ -226,7 +226,7 @@ def _pass(  # type: ignore[no-untyped-def]
     return changed, looked
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _ties(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, tolerance, scale,
     rival, pair, ties, chosen,

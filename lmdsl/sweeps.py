@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from lmdsl import threads
 from lmdsl.directions import Directions
+from lmdsl.kernels import kernel
 
 Floats = NDArray[np.float64]
 
@@ -80,7 +80,7 @@ class System:
         return float(halfway), float(last)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _split(indptr, indices, data, end, out_indices, out_data, inverse):  # type: ignore[no-untyped-def]
     for i in range(len(inverse)):
         own, used = 0.0, indptr[i]
@@ -95,14 +95,14 @@ def _split(indptr, indices, data, end, out_indices, out_data, inverse):  # type:
         end[i] = used
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count(begin, end, indices, count):  # type: ignore[no-untyped-def]
     for i in range(len(begin)):
         for e in range(begin[i], end[i]):
             count[indices[e] + ONE] += ONE
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _turn(begin, end, indices, data, used, out_indices, out_data):  # type: ignore[no-untyped-def]
     """Write every entry of row i and column j into row j; ``used`` is where each row goes on."""
     for i in range(np.uint64(len(begin))):
@@ -113,7 +113,7 @@ def _turn(begin, end, indices, data, used, out_indices, out_data):  # type: igno
             used[j] += ONE
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gauss_seidel(  # type: ignore[no-untyped-def]
     begin, end, indices, data, inverse, orders, cycle, b, x, count, enough, flat
 ):
@@ -146,7 +146,7 @@ def _gauss_seidel(  # type: ignore[no-untyped-def]
     return halfway, change
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sweep(  # type: ignore[no-untyped-def]
     first, last, begin, end, indices, data, inverse, b, old, x, order, downwards, measured, top
 ):

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, TypeVar
 
-from numba import config
+from lmdsl import kernels
 
 Part = TypeVar("Part")
 Outcome = TypeVar("Outcome")
@@ -33,7 +33,7 @@ def count() -> int:
         processors = len(os.sched_getaffinity(0))
     except AttributeError:  # not on this operating system
         processors = os.cpu_count() or 1
-    return max(1, min(processors, int(config.NUMBA_NUM_THREADS)))
+    return max(1, min(processors, int(kernels.threads)))
 
 
 def ranges(total: int, count: int) -> list[tuple[int, int]]:

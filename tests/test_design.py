@@ -17,6 +17,7 @@ PACKAGE = Path(lm.__file__).parent
 # Data flows one way: a module imports only from modules on an earlier line.
 ORDER = """
 errors frozen
+kernels
 files staging
 formulas
 intervals

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from lmdsl.cli import feasibility, listing, results, solving
-from lmdsl.cli.output import Arguments, Run, print_json
+from lmdsl.cli.output import Arguments, Run, narrated, print_json
 from lmdsl.deadline import TimeLimitReached
 from lmdsl.errors import LmdslError, shown
 
@@ -30,7 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as stop:
         return int(stop.code or 0)
     try:
-        status = int(parsed.run(parsed))
+        with narrated():
+            status = int(parsed.run(parsed))
         sys.stdout.flush()
         return status
     except BrokenPipeError:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 Arguments = argparse.Namespace
@@ -51,3 +53,36 @@ class Progress:
     def __exit__(self, *_: object) -> None:
         if self.shown and self.stage:
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+class Narrator(logging.Handler):
+    """What lmdsl logs, on stderr: its warnings; on a terminal, while kernels are compiled, that."""
+
+    compiled = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Show a record; a line about kernels goes when they are done."""
+        busy, text = getattr(record, "busy", None), f"lmdsl: {safe(record.getMessage())}\n"
+        if busy is not None:
+            text = "\r\x1b[K"
+            if busy:
+                text += f"compiling kernels, once ({self.compiled} done) ..."
+            self.compiled += not busy
+        with suppress(OSError, ValueError, AttributeError):  # stderr may be closed, or None
+            if busy is None or sys.stderr.isatty():
+                sys.stderr.write(text)
+                sys.stderr.flush()
+
+
+@contextmanager
+def narrated() -> Iterator[None]:
+    """Show what lmdsl logs while a command runs."""
+    log, narrator = logging.getLogger("lmdsl"), Narrator()
+    level = log.level
+    log.addHandler(narrator)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+        log.removeHandler(narrator)
