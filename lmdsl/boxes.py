@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.axis import EDGE
 from lmdsl.kernels import kernel
-from lmdsl.partition import EDGE, Partition
+from lmdsl.partition import Partition
 
 Ends = dict[str, tuple[float, float]]
 

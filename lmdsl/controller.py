@@ -48,7 +48,8 @@ class Controller:
         Parameters
         ----------
         x
-            Shape (..., d), in the order of the axes; periodic axes wrap.
+            Shape (..., d), in the order of the axes. Periodic axes wrap; under ``on_exit: clip``
+            a state outside the box has the control of the nearest one inside.
 
         Returns
         -------
@@ -63,8 +64,8 @@ class Controller:
         d = self.partition.dimension
         if states.shape[-1:] != (d,):
             raise BadInput(f"states have shape (..., {d}), not {states.shape}")
-        flat = states.reshape(-1, d)
-        cell = self.partition.locate(list(flat.T), clip=False)
+        flat = self.partition.states(states.reshape(-1, d))
+        cell = self.partition.locate(list(flat.T))
         return self.at(cell, flat).reshape(*states.shape[:-1], self.vectors.shape[1])
 
     def at(self, cell: Indices, x: Floats | None = None) -> Floats:
@@ -188,14 +189,12 @@ class ClosedLoop:
             noise = self.nodes.values[node]
             values |= {name: noise[:, k] for k, name in enumerate(self.problem.noises)}
         images = [np.broadcast_to(image, len(x)) for image in self.map(values)]
-        return self._into_box(np.stack(images, axis=-1)), self.partition.locate(images)
+        return self.enter(np.stack(images, axis=-1))
 
-    def _into_box(self, x: Floats) -> Floats:
-        p = self.partition
-        with np.errstate(invalid="ignore"):
-            wrapped = p.low + np.mod(x - p.low, p.high - p.low)
-        inside = np.clip(x, p.low, p.high) if p.clip else x
-        return np.where(p.periodic, wrapped, inside)
+    def enter(self, x: Floats) -> tuple[Floats, Indices]:
+        """Return the states that images or starts become, and their cells."""
+        states = self.partition.states(x)
+        return states, self.partition.locate(list(states.T))
 
     def run(
         self, x: Floats, steps: int, rng: np.random.Generator
@@ -209,8 +208,8 @@ class ClosedLoop:
         arrived
             The states in which the runs that reached A entered it, in no particular order.
         """
+        x, cell = self.enter(x)
         arrived = [x[:0]]
-        cell = self.partition.locate(list(x.T))
         outcome = np.full(len(x), CYCLING, dtype=np.int64)
         taken = np.full(len(x), steps, dtype=np.int64)
         active = np.arange(len(x))
@@ -236,7 +235,7 @@ class ClosedLoop:
         local = self.controller.local
         if local is None:
             raise BadInput("the problem names no local controller", "local_controller")
-        cell, runs = self.partition.locate(list(x.T)), len(x)
+        (x, cell), runs = self.enter(x), len(x)
         stayed = np.ones(runs, dtype=np.bool_)
         for _ in range(steps):
             x, cell = self.step(x, cell, rng)
@@ -264,9 +263,8 @@ class ClosedLoop:
     def path(self, x: ArrayLike, steps: int, seed: int = 0) -> Floats:
         """Return the states of one run, shape (steps taken + 1, d), ending in A or with a loss."""
         rng = np.random.default_rng(seed)
-        state = np.asarray(x, dtype=np.float64).reshape(1, -1)
+        state, cell = self.enter(np.asarray(x, dtype=np.float64).reshape(1, -1))
         states = [state[0]]
-        cell = self.partition.locate(list(state.T))
         while len(states) <= steps and cell[0] >= 0 and self.status[cell[0]] == 1:
             state, cell = self.step(state, cell, rng)
             states.append(state[0])

@@ -48,7 +48,7 @@ class Axis(Declared):
     cells
         Number of equal cells.
     periodic
-        True on a circle: images are wrapped into [low, high).
+        True on a circle: images are wrapped into [low, high].
     """
 
     low: Number

@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.axis import EDGE
 from lmdsl.graph import CellStatus
-from lmdsl.partition import EDGE
 from lmdsl.result import jsonable
 from lmdsl.sampler import CHUNK, Sampler
 from lmdsl.sampling import control_values
@@ -130,12 +130,10 @@ class _Trial:
         images, over = [], np.zeros((2 * p.dimension, *shape))
         for k, given in enumerate(self.sampler.step(named)):
             x = np.broadcast_to(given.reshape((1,) * (4 - given.ndim) + given.shape), shape)
-            low, high = float(p.low[k]), float(p.high[k])
-            if p.periodic[k]:
-                x = low + np.mod(x - low, high - low)
-            elif p.clip:
-                x = np.clip(x, low, high)
+            if p.periodic[k] or p.clip:
+                x = p.axes[k].state(x, p.clip)
             else:
+                low, high = float(p.low[k]), float(p.high[k])
                 beyond = EDGE * float(p.width[k])
                 for side, by in ((2 * k, low - x), (2 * k + 1, x - high)):
                     over[side] = np.where(by > beyond, by, 0.0)

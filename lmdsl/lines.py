@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.axis import Axis, circle, interval
 from lmdsl.formulas import PLAIN
 from lmdsl.kernels import kernel
 from lmdsl.merging import add_cost, settle_cost
-from lmdsl.partition import Axis, circle, interval
 from lmdsl.program import Instruction, Program
 
 Floats = NDArray[np.float64]
@@ -278,7 +278,7 @@ def _locate(image, axis, clip, index):  # type: ignore[no-untyped-def]
     """Add the indices on one axis; ``axis`` has the fields of :class:`lmdsl.partition.Axis`."""
     low, high, width, cells, stride = axis[0], axis[1], axis[2], axis[3], axis[4]
     if axis[5] > 0.0:
-        circle(image, low, width, cells, stride, index)
+        circle(image, low, high, width, cells, stride, index)
     else:
         interval(image, low, high, width, cells, stride, clip, index)
 

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.axis import EDGE
 from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.intervals import Interval, add, intersection, multiply, subtract
 from lmdsl.jets import Jet, apply
 from lmdsl.local import LocalController
-from lmdsl.partition import EDGE, Partition
+from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.program import FUNCTION
 from lmdsl.sampling import noise_nodes

@@ -1,9 +1,9 @@
 """Geometry of the cells: index, centre, sample points, and the cells of a point or a box.
 
 The state box is a product of equal cells; a cell's index is the C order of its multi-index (last
-axis fastest). An image x lies in cell floor(t + 1e-9), t = (x - low) / width, on every axis. One
-compiled function, :meth:`Partition.locate`, decides this for compilation, controller and
-simulation alike, so that they can never disagree about an edge.
+axis fastest). An image is a state first, wrapped or clipped into the box, and then lies in a cell.
+One rule (axis.py) decides this for compilation, controller, simulation and proofs alike, so that
+they can never disagree about an edge.
 """
 
 from __future__ import annotations
@@ -12,18 +12,14 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.axis import EDGE, Axis
 from lmdsl.errors import BadInput
 from lmdsl.frozen import Frozen
-from lmdsl.kernels import fixed, kernel
 from lmdsl.problem import Problem
-
-EDGE = 1e-9
-"""Width of an edge in cells: points this close to an edge count as lying on it."""
 
 MAX_CELLS = 2**31 - 2
 
@@ -131,6 +127,41 @@ class Partition(Frozen):
                 total = total + axis.add_index(x, saturate, None)
         return np.zeros(()) if total is None else total
 
+    def states(self, images: Floats, clip: bool | None = None) -> Floats:
+        """Return images as states, shape (r, d): wrapped and, under ``clip``, moved into the box.
+
+        NaN on a circle of which an image is too many turns away. Parameters as for :meth:`locate`.
+        """
+        saturate = self.clip if clip is None else clip
+        columns = [axis.state(images[:, k], saturate) for k, axis in enumerate(self.axes)]
+        return np.stack(columns, axis=-1)
+
+    def domain(self, cell: NDArray[np.integer]) -> tuple[Floats, Floats, Indices]:
+        """Return boxes that hold all states, sample points and corners of cells.
+
+        A first cell on a circle has states at both ends of the axis, near ``high`` up to ``high``
+        itself; it has a box at each.
+
+        Returns
+        -------
+        low, high : shape (boxes, d)
+            The ends.
+        owner : shape (boxes,)
+            Position in ``cell`` of the cell of each box; the first boxes are those of the cells in
+            order.
+        """
+        index = np.stack(self.multi_index(cell), axis=-1).astype(np.float64)
+        margin = np.array([axis.margin for axis in self.axes])
+        first, last, owner = index - margin, index + 1 + margin, np.arange(len(index))
+        for k in np.flatnonzero(self.periodic):
+            seam = np.flatnonzero(first[:, k] < 0)
+            first, last, owner = (
+                np.concatenate([ends, ends[seam]]) for ends in (first, last, owner)
+            )
+            beyond = slice(len(first) - len(seam), None)
+            first[beyond, k], last[beyond, k] = self.cells[k] - margin[k], self.cells[k] + margin[k]
+        return self.low + first * self.width, self.low + last * self.width, owner
+
     @cached_property
     def axes(self) -> tuple[Axis, ...]:
         """The axes in plain numbers."""
@@ -172,23 +203,18 @@ class Partition(Frozen):
     def around_point(self, point: Sequence[float], where: str) -> tuple[Indices, ...]:
         """Return the block of closed cells within 1e-9 widths of a point."""
         block = []
-        for k, x in enumerate(point):
-            t = _units(x, self.low[k], self.width[k])
-            n = int(self.cells[k])
-            if self.periodic[k]:
-                if not abs(t) < 2**52:
-                    raise BadInput(f"{x!r} is too many turns away from the axis", where)
-                first, last = math.ceil(t - 1 - EDGE), math.floor(t + EDGE)
-                block.append(np.unique(np.arange(first, last + 1) % n))
-                continue
-            if not -EDGE <= t <= n + EDGE:
+        for axis, name, x in zip(self.axes, self.names, point, strict=True):
+            state = float(axis.state(np.asarray(x, dtype=np.float64), clip=False))
+            t, n = _units(state, axis.low, axis.width), int(axis.cells)
+            if math.isnan(t):
+                raise BadInput(f"{x!r} is too many turns away from the axis", f"{where}.{name}")
+            if not (-EDGE <= t <= n + EDGE or axis.low <= state <= axis.high):
                 raise BadInput(
-                    f"{x!r} is outside the axis {self.names[k]} = "
-                    f"[{float(self.low[k])!r}, {float(self.high[k])!r}]",
-                    f"{where}.{self.names[k]}",
+                    f"{x!r} is outside the axis {name} = [{axis.low!r}, {axis.high!r}]",
+                    f"{where}.{name}",
                 )
-            first, last = math.ceil(t - 1 - EDGE), math.floor(t + EDGE)
-            block.append(np.arange(max(first, 0), min(last, n - 1) + 1))
+            touched = np.arange(math.ceil(t - 1 - EDGE), math.floor(t + EDGE) + 1)
+            block.append(np.unique(touched % n if axis.periodic else np.clip(touched, 0, n - 1)))
         return tuple(block)
 
     def inside_box(self, box: Mapping[str, tuple[float, float]], where: str) -> tuple[Indices, ...]:
@@ -240,72 +266,3 @@ def _units(x: float, low: float, width: float) -> float:
     """Return (x - low) / width; infinite where it overflows."""
     with np.errstate(over="ignore"):
         return float((x - low) / width)
-
-
-class Axis(NamedTuple):
-    """One axis in plain numbers; ``stride`` cells of the box lie between neighbours on it."""
-
-    low: float
-    high: float
-    width: float
-    cells: float
-    stride: float
-    periodic: bool
-
-    def add_index(self, image: Floats, clip: bool, total: Floats | None) -> Floats:
-        """Add the index on this axis, times the stride, to the indices on others; NaN outside.
-
-        Without a total it is a new array in the shape of the image.
-        """
-        found = np.zeros(image.shape) if total is None else total
-        flat, line = fixed(np.ascontiguousarray(image).reshape(-1)), found.reshape(-1)
-        if self.periodic:
-            circle(flat, self.low, self.width, self.cells, self.stride, line)
-        else:
-            interval(flat, self.low, self.high, self.width, self.cells, self.stride, clip, line)
-        return found
-
-
-# The two kernels have no branch in the loop, so that they run on vectors of doubles.
-@kernel(error_model="numpy")  # division by zero cannot occur, and its test would be a branch
-def circle(image, low, width, cells, stride, index):  # type: ignore[no-untyped-def]
-    """Add stride (k mod cells), k = floor((x - low)/width + EDGE); NaN where k is not finite.
-
-    For |k| < 2^51 the quotient floor(k/cells) is off by at most one, its multiple of cells and the
-    rest are exact, and one addition brings the rest into 0..cells-1.
-    """
-    inverse = 1.0 / cells
-    far = False
-    for i in range(len(image)):
-        k = np.floor((image[i] - low) / width + EDGE)
-        rest = k - cells * np.floor(k * inverse)
-        rest = rest + cells if rest < 0.0 else rest
-        rest = rest - cells if rest >= cells else rest
-        near = abs(k) < 2.0**51
-        far |= not near
-        index[i] += stride * rest if near else 0.0
-    if far:
-        for i in range(len(image)):
-            k = np.floor((image[i] - low) / width + EDGE)
-            if not abs(k) < 2.0**51:
-                index[i] += stride * (k % cells) if np.isfinite(k) else np.nan
-
-
-@kernel(error_model="numpy")
-def interval(image, low, high, width, cells, stride, clip, index):  # type: ignore[no-untyped-def]
-    """Add stride k, k = floor((x - low)/width + EDGE), for 0 <= k < cells; NaN elsewhere.
-
-    An image up to EDGE above the last cell belongs to it. With ``clip`` a finite image is moved
-    into the interval first.
-    """
-    for i in range(len(image)):
-        x = image[i]
-        finite = abs(x) < np.inf
-        if clip:
-            x = low if x < low else x
-            x = high if x > high else x
-        t = (x - low) / width
-        k = np.floor(t + EDGE)
-        last = (k >= cells) & ((t - cells <= EDGE) | (clip & (x == high)))
-        k = cells - 1.0 if last else k
-        index[i] += stride * k if finite & (k >= 0.0) & (k < cells) else np.nan

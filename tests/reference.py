@@ -23,7 +23,8 @@ import numpy as np
 from scipy.stats import qmc
 
 ATTRACTOR, STABILIZED, ESCAPES, TRAPPED, LEADS, AVOID = range(6)
-EDGE = 1e-9  # in cell widths: how close to an edge counts as on it
+EDGE = 1e-9
+TURNS = 2.0**20  # in cell widths: how close to an edge counts as on it
 
 STANDARD_MAP = {"x": "x + y + K*u*sin(2*pi*x)", "y": "y + K*u*sin(2*pi*x)"}
 
@@ -101,15 +102,28 @@ class Axis:
         """Position counted in cell widths from `low`."""
         return (value - self.low) / self.width
 
+    def wrapped(self, value: float) -> float | None:
+        """The place on a circle of a number, None if it is not finite or too many turns away."""
+        span = self.high - self.low
+        away = value - self.low
+        if not abs(away / span) <= TURNS + 1:
+            return None
+        turns = math.floor(away / span)
+        if self.low <= value <= self.high:
+            return value
+        place = self.low + min(max(away - turns * span, 0.0), span)
+        return min(place, self.high) if abs(turns) <= TURNS else None
+
     def cell_of(self, value: float) -> int | None:
         """Cell of an image, None if it is outside."""
+        if self.periodic:
+            place = self.wrapped(value)
+            return None if place is None else math.floor(self.scaled(place) + EDGE) % self.cells
         t = self.scaled(value)
         if not math.isfinite(t):
             return None
         k = math.floor(t + EDGE)
-        if self.periodic:
-            return k % self.cells
-        if abs(t - self.cells) <= EDGE:
+        if abs(t - self.cells) <= EDGE or (k == self.cells and value <= self.high):
             return self.cells - 1
         return k if 0 <= k < self.cells else None
 
@@ -118,7 +132,8 @@ class Axis:
         t = self.scaled(value)
         images = [t]
         if self.periodic:
-            t = t - math.floor(t / self.cells) * self.cells
+            place = self.wrapped(value)
+            t = math.nan if place is None else self.scaled(place)
             images = [t - self.cells, t, t + self.cells]
         return [i for i in range(self.cells) if any(i - EDGE <= s <= i + 1 + EDGE for s in images)]
 

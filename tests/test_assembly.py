@@ -10,25 +10,33 @@ import pytest
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import merging, partition, sampler, threads
+from lmdsl import axis, merging, sampler, threads
+from lmdsl.axis import EDGE
 from lmdsl.merging import mean_cost, merge, tile
-from lmdsl.partition import EDGE, Partition
+from lmdsl.partition import Partition
 
 
 def cell_of(x, low, high, cells, periodic, clip):
     """The cell of a point on one axis, word for word as docs/problem-file.md has it."""
     if not math.isfinite(x):
         return -1
-    if clip and not periodic:
+    span = high - low
+    if periodic and not low <= x <= high:
+        q = (x - low) / span
+        if not abs(q) < 2.0**60 or abs(math.floor(q)) > 2**20:
+            return -1
+        r = min(max((x - low) - math.floor(q) * span, 0.0), span)
+        x = min(low + r, high)
+    elif clip and not periodic:
         x = min(max(x, low), high)
-    width = (high - low) / cells
+    width = span / cells
     t = (x - low) / width
     if not math.isfinite(t):
         return -1
     k = math.floor(t + EDGE)
     if periodic:
         return k % cells
-    if k == cells and (t - cells <= EDGE or (clip and x == high)):
+    if k >= cells and (x <= high or t - cells <= EDGE):
         return cells - 1
     return k if 0 <= k < cells else -1
 
@@ -38,10 +46,14 @@ def cell_of(x, low, high, cells, periodic, clip):
 @pytest.mark.parametrize(("low", "high", "cells"), [(0, 1, 50), (-0.3, 2.1, 7), (3.0, 9.7, 1)])
 def test_a_point_lies_in_the_cell_that_the_format_says(low, high, cells, periodic, clip):
     rng = np.random.default_rng(0)
-    width = (high - low) / cells
+    span, width = high - low, (high - low) / cells
     edges = low + np.arange(-3 * cells, 4 * cells) * width
     near = [edges * (1 + a) + b * width for a in (0, 2e-16, -2e-16) for b in (0, EDGE, -EDGE)]
-    huge = [s * 10.0**e for s in (1, -1) for e in range(2, 308, 9)] + [2.0**51 * width, 1.7e308]
+    huge = [s * 10.0**e for s in (1, -1) for e in range(2, 308, 9)] + [
+        2.0**20 * span,
+        2.0**51 * width,
+        1.7e308,
+    ]
     odd = [math.nan, math.inf, -math.inf, 0.0, -0.0, low, high, 5e-324]
     x = np.concatenate([*near, rng.uniform(low - 9, high + 9, 500), huge, odd])
     data = standard_map(8)
@@ -202,10 +214,9 @@ def test_results_come_in_order_and_the_first_error_ends_them(monkeypatch, count)
 
 
 def test_circles_of_every_number_of_cells():
-    """49 (1 / 49) < 1 in doubles: the first cell of the next turn must not become cell 49."""
-    assert any(m * (1 / m) < 1 for m in range(1, 400))
+    """The first cell of the next turn must not become the cell after the last."""
     for cells in range(1, 400):
-        k = np.concatenate([np.arange(-3 * cells, 3 * cells), cells * 10.0 ** np.arange(2, 13)])
+        k = np.concatenate([np.arange(-3 * cells, 3 * cells), cells * 10.0 ** np.arange(2, 7)])
         index = np.zeros(len(k))
-        partition.circle(k + 0.5, 0.0, 1.0, float(cells), 1.0, index)
+        axis.circle(k + 0.5, 0.0, float(cells), 1.0, float(cells), 1.0, index)
         np.testing.assert_array_equal(index, k % cells)

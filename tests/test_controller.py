@@ -23,11 +23,6 @@ def test_vectorised_call_wraps_and_knows_its_limits():
     assert np.isnan(line.controller([[-0.1], [1.1], [0.1]])).all()
 
 
-def test_a_clipped_problem_still_has_no_control_outside():
-    result = lm.solve(made(steps(on_exit="clip")))
-    assert np.isnan(result.controller([5.0])).all()
-
-
 def test_closed_loop_wraps():
     loop = lm.solve(made(doubling())).closed_loop
     x, cell = loop.step(np.array([[0.8], [0.3]]), np.array([1, 0]), np.random.default_rng(0))

@@ -29,7 +29,7 @@ systems.*
 systems
 declarations
 problem
-sampling memory threads directions deadline
+sampling memory threads directions deadline axis
 apart linprog
 sweeps
 peeling merging leaps

@@ -365,7 +365,7 @@ def graph(ax: Any, view: View, x: Floats, image: Floats, orbit: Floats) -> None:
     ax.set_ylim(low, high)
     ax.set_ylabel(f"next {view.label(0)}")
     if view.partition.periodic[0]:
-        image = low + np.mod(image - low, high - low)
+        image = view.partition.axes[0].state(image, clip=False)
         image[1:][np.abs(np.diff(image)) > (high - low) / 2] = np.nan
     ax.plot([low, high], [low, high], color=FAINT, linewidth=0.8)
     ax.plot(x, image, color=CYCLE[0], linewidth=1.8)

@@ -73,14 +73,6 @@ def constant_map(problem: Problem, fine: bool = False) -> Map:
     return image
 
 
-def into_box(partition: Partition, x: Floats) -> Floats:
-    """Wrap periodic axes and, where the problem clips, saturate the others."""
-    with np.errstate(invalid="ignore"):
-        turned = np.mod(x - partition.low, partition.high - partition.low)
-        kept = np.clip(x, partition.low, partition.high) if partition.clip else x
-    return np.where(partition.periodic, partition.low + turned, kept)
-
-
 def open_loop(
     problem: Problem,
     partition: Partition,
@@ -95,15 +87,14 @@ def open_loop(
     """
     image = constant_map(problem, fine)
     points = np.full((steps * (PIECES if fine else 1) + 1, *x.shape), np.nan)
-    points[0] = x
+    points[0] = partition.states(x)
     active = np.arange(len(x))
     held = np.tile(list(u.values()), (len(x), 1))
     for n in range(len(points) - 1):
-        following = image(points[n, active], held[active])
-        inside = partition.locate(list(following.T)) >= 0
+        following = partition.states(image(points[n, active], held[active]))
         finite = np.isfinite(following).all(axis=1)
-        points[n + 1, active[finite]] = into_box(partition, following[finite])
-        active = active[inside]
+        points[n + 1, active[finite]] = following[finite]
+        active = active[partition.locate(list(following.T)) >= 0]
         if not len(active):
             break
     return points
@@ -139,7 +130,7 @@ def closed_loop(
     rng = np.random.default_rng(seed)
     fine = is_ode(problem) and not problem.noises
     inner = constant_map(problem, fine) if fine else None
-    cell = p.locate(list(x.T))
+    x, cell = loop.enter(x)
     points = [x]
     for _ in range(steps):
         on = np.flatnonzero((cell >= 0) & (result.cell_status[cell] == CellStatus.STABILIZED))
@@ -150,7 +141,7 @@ def closed_loop(
         u = loop.controller.at(state, here)
         for _ in range(PIECES - 1 if inner else 0):
             here = inner(here, u) if inner else here
-            points.append(_scatter(x, on, into_box(p, here)))
+            points.append(_scatter(x, on, p.states(here)))
         points.append(_scatter(x, on, following))
     return np.array(points), cell, PIECES if fine else 1
 
