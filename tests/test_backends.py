@@ -5,11 +5,16 @@ policy iteration.
 """
 
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +25,7 @@ from lmdsl.backends import BUILT_IN, Options, Solution, Stop, get, names, resolv
 from lmdsl.backends import clarabel as clarabel_backend
 from lmdsl.backends import cvxpy as cvxpy_backend
 from lmdsl.backends import highs as highs_backend
+from lmdsl.backends import ipopt as ipopt_backend
 from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.cli import main
 from lmdsl.errors import BadInput, MissingDependency
@@ -29,7 +35,9 @@ from lmdsl.systems import StandardMap
 from lmdsl.testing import known
 
 SPECS = [
-    f"{name}:{algorithm}" for name in BUILT_IN for algorithm in get(name).capabilities.algorithms
+    f"{name}:{algorithm}"
+    for name in backends.installed()
+    for algorithm in get(name).capabilities.algorithms
 ]
 SPECS += [f"cvxpy:{solver}" for solver in ("", "clarabel", "highs", "scipy", "scs", "osqp")]
 SLOW = {"cvxpy:osqp"}  # too slow for the standard map
@@ -216,6 +224,50 @@ def test_no_tolerance_is_looser_than_without_one(name):
             assert getattr(settings, option) <= getattr(clarabel.DefaultSettings(), option)
 
 
+# Ipopt ---------------------------------------------------------------------------------------
+
+
+def test_multipliers_that_prove_nothing_are_no_refusal():
+    scaled = ScaledLP.of(steps(1.0))
+    for y in (np.ones(3), -np.ones(3), np.zeros(3), np.full(3, np.nan), np.full(3, np.inf)):
+        assert not ipopt_backend._proves_infeasible(scaled, y)
+    impossible = ScaledLP.of(known.single(3.0).compile())
+    assert ipopt_backend._proves_infeasible(impossible, np.array([1e50]))
+    assert not ipopt_backend._proves_infeasible(impossible, np.array([-1e50]))
+
+
+def test_ctrl_c_ends_ipopt_and_the_solve():
+    pytest.importorskip("casadi")
+    lp = model.compile(Problem.model_validate(StandardMap.problem))  # some seconds
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            solve("ipopt", lp)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        timer.cancel()
+        signal.signal(signal.SIGINT, before)
+
+
+def test_ipopt_solves_in_any_thread():
+    pytest.importorskip("casadi")
+    found = []
+    thread = threading.Thread(target=lambda: found.append(solve("ipopt", steps(1.0))))
+    thread.start()
+    thread.join()
+    assert found[0].stop is Stop.OPTIMAL
+
+
+def test_ipopt_prints_nothing(capfd):
+    pytest.importorskip("casadi")
+    for options in ({}, {"max_iterations": 0}, {"max_iterations": 1}, {"time_limit": 1e-9}):
+        solve("ipopt", steps(1.0), **options)
+    solve("ipopt", known.single(3.0).compile())
+    assert capfd.readouterr() == ("", "")
+
+
 # Statuses ------------------------------------------------------------------------------------
 
 
@@ -231,6 +283,16 @@ def clarabel_statuses():
     return {name for name in dir(clarabel.SolverStatus) if not name.startswith("_")}
 
 
+def ipopt_statuses():
+    casadi = pytest.importorskip("casadi")
+    header = Path(casadi.__file__).parent / "include/coin-or/IpReturnCodes_inc.h"
+    if not header.exists():
+        pytest.skip("this casadi comes without the header of Ipopt's statuses")
+    return set(
+        re.findall(r"^\s*(\w+)\s*=\s*-?\d+", header.read_text().split("AlgorithmMode")[0], re.M)
+    )
+
+
 def cvxpy_statuses():
     from cvxpy import settings
 
@@ -243,6 +305,7 @@ def cvxpy_statuses():
         (highs_backend, highs_statuses),
         (clarabel_backend, clarabel_statuses),
         (cvxpy_backend, cvxpy_statuses),
+        (ipopt_backend, ipopt_statuses),
     ],
 )
 def test_statuses_are_mapped_by_their_names(backend, statuses):
@@ -253,7 +316,8 @@ def test_statuses_are_mapped_by_their_names(backend, statuses):
     )
     assert len(known & statuses()) > 0.8 * len(known)
     success = {word for word, stop in backend.STOPS.items() if stop.success}
-    assert success <= {"kOptimal", "Solved", "AlmostSolved", "optimal", "optimal_inaccurate"}
+    assert success <= {"kOptimal", "Solved", "AlmostSolved", "optimal", "optimal_inaccurate",
+                       "Solve_Succeeded", "Solved_To_Acceptable_Level"}  # fmt: skip
 
 
 def test_almost_at_a_limit_is_the_limit():
@@ -274,14 +338,15 @@ def test_almost_at_a_limit_is_the_limit():
 
 
 def test_every_built_in_backend_carries_its_name():
-    assert [get(name).name for name in BUILT_IN] == list(BUILT_IN) == list(names())[: len(BUILT_IN)]
+    assert [import_module(BUILT_IN[name]).BACKEND.name for name in BUILT_IN] == list(BUILT_IN)
+    assert list(BUILT_IN) == list(names())[: len(BUILT_IN)]
 
 
 def test_no_solver_is_imported_unasked():
     code = (
         "import sys, lmdsl.backends as b\n"
-        "[b.get(name) for name in b.BUILT_IN]\n"
-        "print([m for m in ('highspy', 'clarabel', 'cvxpy') if m in sys.modules])"
+        "[b.get(name) for name in b.installed()]\n"
+        "print([m for m in ('highspy', 'clarabel', 'cvxpy', 'casadi') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

@@ -11,7 +11,7 @@ import pytest
 from problems import made, steps
 
 import lmdsl as lm
-from lmdsl.backends import BUILT_IN, Backend, Capabilities, Solution, Stop, get
+from lmdsl.backends import Backend, Capabilities, Solution, Stop, get, installed
 from lmdsl.backends.policy_iteration import solve as howard
 from lmdsl.policy import evaluate
 from lmdsl.testing import Check, ContractFailure, Report, check_backend, known
@@ -20,7 +20,7 @@ from lmdsl.testing.probe import judge
 
 SPECS = [
     f"{name}:{algorithm}"
-    for name in BUILT_IN
+    for name in installed()
     for algorithm in get(name).capabilities.algorithms or ("clarabel", "highs", "scipy", "scs")
 ]
 

@@ -137,7 +137,7 @@ def test_solver_libraries_are_imported_in_their_own_file_only():
     for name, path in modules():
         for imported in imports(path):
             library = imported.split(".")[0]
-            if library in ("highspy", "clarabel", "cvxpy"):
+            if library in ("highspy", "clarabel", "cvxpy", "casadi"):
                 assert name.startswith("backends."), f"{name} imports {library}"
 
 

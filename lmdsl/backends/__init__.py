@@ -1,4 +1,4 @@
-"""The registry of backends: four of our own, any number by entry point ``lmdsl.backends``.
+"""The registry of backends: our own, any number by entry point ``lmdsl.backends``.
 
 An entry point names a :class:`Backend`. Nothing is imported before it is asked for.
 """
@@ -19,6 +19,7 @@ BUILT_IN = {
     "highs": "lmdsl.backends.highs",
     "clarabel": "lmdsl.backends.clarabel",
     "cvxpy": "lmdsl.backends.cvxpy",
+    "ipopt": "lmdsl.backends.ipopt",
 }
 DEFAULT = "policy-iteration"
 FLAGS = [field.name for field in fields(Capabilities) if isinstance(field.default, bool)]
@@ -30,6 +31,7 @@ __all__ = [
     "Solution",
     "Stop",
     "get",
+    "installed",
     "missing",
     "names",
     "resolve",
@@ -39,6 +41,11 @@ __all__ = [
 def names() -> tuple[str, ...]:
     """Return the names of all backends, ours first."""
     return (*BUILT_IN, *(name for name in _third_party() if name not in BUILT_IN))
+
+
+def installed() -> tuple[str, ...]:
+    """Return the names of our backends whose packages are installed; nothing is imported."""
+    return tuple(name for name in BUILT_IN if all(map(_found, _record(name).requires)))
 
 
 def get(name: str) -> Backend:
@@ -52,7 +59,7 @@ def get(name: str) -> Backend:
         A package it needs is not installed.
     """
     if name in BUILT_IN:
-        backend: Backend = import_module(BUILT_IN[name]).BACKEND
+        backend = _record(name)
     elif name in (offered := _third_party()):
         backend = _loaded(name, offered[name])
     else:
@@ -134,6 +141,11 @@ def resolve(spec: str | Backend) -> tuple[Backend, str | None]:
             "backend",
         )
     return backend, algorithm or None
+
+
+def _record(name: str) -> Backend:
+    found: Backend = import_module(BUILT_IN[name]).BACKEND
+    return found
 
 
 def _third_party() -> dict[str, list[EntryPoint]]:
