@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
-    AfterValidator,
     BeforeValidator,
     Discriminator,
     Field,
@@ -20,11 +19,14 @@ from lmdsl.declared import (
     Box,
     Count,
     Declared,
-    FrozenDict,
+    FormulaText,
     Number,
     Numbers,
+    Positive,
+    SchemaWords,
     Seed,
     frozen_dict,
+    named_keys,
     plain,
     valid_names,
 )
@@ -35,7 +37,13 @@ MAX_AXES = 16
 MAX_HERMITE = 64
 MAX_BOXES = 10_000
 
-Positive = Annotated[Number, Field(gt=0)]
+
+class _Each(SchemaWords):
+    """Words for each number of a list."""
+
+    def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
+        schema = handler(core)
+        return {**schema, "items": {**schema["items"], **self.words}}
 
 
 class Axis(Declared):
@@ -90,7 +98,7 @@ class ControlRange(Declared):
 class ControlValues(Declared):
     """Control values written out; distinct, order kept."""
 
-    values: Annotated[Numbers, Field(min_length=1)]
+    values: Annotated[Numbers, SchemaWords({"uniqueItems": True})]
 
     @model_validator(mode="after")
     def _distinct(self) -> ControlValues:
@@ -105,8 +113,8 @@ class ControlValues(Declared):
 class NoiseValues(Declared):
     """A discrete noise variable: values and their probabilities."""
 
-    values: Annotated[Numbers, Field(min_length=1)]
-    weights: Annotated[Numbers, Field(min_length=1)]
+    values: Numbers
+    weights: Annotated[Numbers, _Each({"minimum": 0, "maximum": 1 + 1e-9})]
 
     @model_validator(mode="after")
     def _distribution(self) -> NoiseValues:
@@ -135,7 +143,7 @@ class Normal(Declared):
     """A normal distribution of mean 0 by Gauss-Hermite quadrature."""
 
     std: Positive
-    points: Annotated[Count, Field(le=MAX_HERMITE)]
+    points: Annotated[int, Field(strict=True, ge=1, le=MAX_HERMITE), BeforeValidator(plain)]
 
 
 class NoiseNormal(Declared):
@@ -196,6 +204,15 @@ def _kinds(*models: type[Declared]) -> Any:
     ]
 
 
+class _KindsOfFiles:
+    """Leaves what no JSON can be out of the JSON Schema of a union."""
+
+    def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
+        schema: dict[str, Any] = handler(core)
+        kinds = [one for one in schema["oneOf"] if handler.resolve_ref_schema(one) != {"not": {}}]
+        return {**schema, "oneOf": kinds}
+
+
 def _json_kinds(value: Any) -> Any:
     if isinstance(value, Mapping) and value.get("kind") == "function":
         raise BadInput(
@@ -210,7 +227,9 @@ if TYPE_CHECKING:
     SamplingUnion = Grid | Random | Sobol
 else:
     SystemUnion = Annotated[
-        _kinds(MapSystem, OdeSystem, *NAMED.values(), FunctionSystem), BeforeValidator(_json_kinds)
+        _kinds(MapSystem, OdeSystem, *NAMED.values(), FunctionSystem),
+        BeforeValidator(_json_kinds),
+        _KindsOfFiles(),
     ]
     SamplingUnion = _kinds(Grid, Random, Sobol)
 ControlUnion = Annotated[
@@ -234,9 +253,10 @@ PerPoint = Annotated[
 AlongOrbit = Annotated[dict[str, PerPoint], BeforeValidator(plain), frozen_dict]
 Gain = Annotated[dict[str, AlongOrbit], BeforeValidator(plain), frozen_dict]
 Point = Annotated[
-    tuple[Number, ...] | dict[str, Number],
+    Annotated[tuple[Number, ...], Tag("<a>")]
+    | Annotated[dict[str, Number], frozen_dict, Tag("<b>")],
+    Discriminator(lambda v: "<b>" if isinstance(v, Mapping) else "<a>"),
     BeforeValidator(plain),
-    AfterValidator(lambda v: FrozenDict(v) if isinstance(v, dict) else v),
 ]
 Points = Annotated[tuple[Point, ...], Field(fail_fast=True), BeforeValidator(plain)]
 Orbit = Annotated[
@@ -246,6 +266,11 @@ Orbit = Annotated[
 ]
 Boxes = Annotated[
     tuple[Box, ...], Field(max_length=MAX_BOXES, fail_fast=True), BeforeValidator(plain)
+]
+SomeBoxes = Annotated[
+    tuple[Box, ...],
+    Field(min_length=1, max_length=MAX_BOXES, fail_fast=True),
+    BeforeValidator(plain),
 ]
 CellIndex = Annotated[
     tuple[Annotated[int, Field(strict=True, ge=0, lt=2**31)], ...], BeforeValidator(plain)
@@ -280,7 +305,7 @@ class Attractor(Declared):
 class Avoid(Declared):
     """Unsafe cells: every cell whose interior overlaps a box. Landing there counts as leaving."""
 
-    boxes: Annotated[Boxes, Field(min_length=1)]
+    boxes: SomeBoxes
 
 
 class Measure(Declared):
@@ -296,9 +321,9 @@ class Measure(Declared):
         One number >= 0 per cell, C order, instead of a density.
     """
 
-    boxes: Annotated[Boxes, Field(min_length=1)] | None = None
-    density: str | None = None
-    weights: Annotated[Numbers, Field(min_length=1)] | None = None
+    boxes: SomeBoxes | None = None
+    density: FormulaText | None = None
+    weights: Annotated[Numbers, _Each({"minimum": 0})] | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> Measure:
@@ -377,10 +402,15 @@ else:
 
 StateBox = Annotated[
     dict[str, Axis],
-    BeforeValidator(plain),
     Field(min_length=1, max_length=MAX_AXES),
+    BeforeValidator(plain),
     valid_names,
+    named_keys,
     frozen_dict,
 ]
-ControlGrid = Annotated[dict[str, ControlUnion], BeforeValidator(plain), valid_names, frozen_dict]
-Noise = Annotated[dict[str, NoiseUnion], BeforeValidator(plain), valid_names, frozen_dict]
+ControlGrid = Annotated[
+    dict[str, ControlUnion], BeforeValidator(plain), valid_names, named_keys, frozen_dict
+]
+Noise = Annotated[
+    dict[str, NoiseUnion], BeforeValidator(plain), valid_names, named_keys, frozen_dict
+]

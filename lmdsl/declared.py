@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
 
 import numpy as np
@@ -15,39 +16,19 @@ from pydantic import (
     ValidationError,
 )
 
-from lmdsl.errors import BadInput, shown
-from lmdsl.files import joined
-from lmdsl.formulas import check_name
+from lmdsl.errors import BadInput
+from lmdsl.faults import condensed
+from lmdsl.formulas import MAX_CHARACTERS, MAX_NAME, RESERVED, check_name
 
 _K = TypeVar("_K")
 _V = TypeVar("_V")
-
-_FIXES = {
-    "bool_type": "write true or false",
-    "dict_type": "write an object in braces",
-    "extra_forbidden": "unknown key; remove it or correct its spelling",
-    "finite_number": "must be a finite number",
-    "float_type": "write a number",
-    "greater_than": "it must be greater than {gt}",
-    "greater_than_equal": "it must be at least {ge}",
-    "int_type": "write a whole number",
-    "less_than": "it must be less than {lt}",
-    "less_than_equal": "it must be at most {le}",
-    "literal_error": "write {expected}",
-    "missing": "required key is missing; add it",
-    "string_type": "write a string",
-    "too_long": "at most {max_length} entries are allowed",
-    "too_short": "give at least {min_length} of them",
-    "tuple_type": "write a list in brackets",
-}
-"""What to do about each kind of fault that pydantic finds."""
 
 
 class FrozenDict(dict[_K, _V]):
     """A dict that cannot be changed, so that a declared problem stays what was validated."""
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
-        raise TypeError("declared objects are frozen; make a new one with model_copy(update=...)")
+        raise TypeError("declared objects are frozen; make a new one (problem.replaced(...))")
 
     __setitem__ = __delitem__ = clear = pop = popitem = setdefault = update = _refuse
     __ior__ = _refuse
@@ -73,27 +54,62 @@ def _named(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
-Number = Annotated[float, BeforeValidator(plain), Field(allow_inf_nan=False, strict=True)]
+@dataclass(frozen=True, eq=False)
+class SchemaWords:
+    """Adds words to the JSON Schema of a type, for what only Python code checks."""
+
+    words: Mapping[str, Any]
+
+    def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
+        return {**handler(core), **self.words}
+
+
+# A bound stands directly behind its type, before any validator: only there does pydantic write it
+# as a word of JSON Schema.
+Number = Annotated[float, Field(allow_inf_nan=False, strict=True), BeforeValidator(plain)]
 """A finite double; booleans, strings, NaN and infinities are refused."""
 
-Count = Annotated[int, BeforeValidator(plain), Field(strict=True, ge=1, le=10**15)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True), BeforeValidator(plain)]
+"""A finite double above 0."""
+
+Count = Annotated[int, Field(strict=True, ge=1, le=10**15), BeforeValidator(plain)]
 """A whole number of at least 1."""
 
-Seed = Annotated[int, BeforeValidator(plain), Field(strict=True, ge=0, lt=2**63)]
+Seed = Annotated[int, Field(strict=True, ge=0, lt=2**63), BeforeValidator(plain)]
 """A seed of a random generator."""
 
-Numbers = Annotated[tuple[Number, ...], Field(fail_fast=True), BeforeValidator(plain)]
-"""A sequence of finite doubles."""
+Numbers = Annotated[tuple[Number, ...], Field(fail_fast=True, min_length=1), BeforeValidator(plain)]
+"""A sequence of finite doubles, at least one."""
+
+FormulaText = Annotated[str, SchemaWords({"minLength": 1, "maxLength": MAX_CHARACTERS})]
+"""A text formula; the model that knows its names parses it."""
 
 frozen_dict = AfterValidator(FrozenDict)
 valid_names = AfterValidator(_named)
+named_keys = SchemaWords(
+    {
+        "propertyNames": {
+            "pattern": "^[A-Za-z_][A-Za-z0-9_]*$",
+            "maxLength": MAX_NAME,
+            "not": {"enum": sorted(RESERVED)},
+        }
+    }
+)
+"""What `valid_names` asks for, in words of JSON Schema."""
 
 Parameters = Annotated[
-    dict[str, Number], Field(max_length=1000), BeforeValidator(plain), valid_names, frozen_dict
+    dict[str, Number],
+    Field(max_length=1000),
+    BeforeValidator(plain),
+    valid_names,
+    named_keys,
+    frozen_dict,
 ]
 """Named constants of a system."""
 
-Formulas = Annotated[dict[str, str], BeforeValidator(plain), valid_names, frozen_dict]
+Formulas = Annotated[
+    dict[str, FormulaText], BeforeValidator(plain), valid_names, named_keys, frozen_dict
+]
 """One formula per state."""
 
 Interval = Annotated[tuple[Number, Number], BeforeValidator(plain)]
@@ -116,7 +132,7 @@ class _Meta(ModelMetaclass):
         try:
             return super().__call__(**kwargs)
         except ValidationError as error:
-            raise bad_input(error) from None
+            raise condensed(error, cls) from None
 
 
 class Declared(BaseModel, metaclass=_Meta):
@@ -132,36 +148,14 @@ class Declared(BaseModel, metaclass=_Meta):
         try:
             return super().model_validate(obj, **kwargs)
         except ValidationError as error:
-            raise bad_input(error) from None
+            raise condensed(error, cls) from None
 
-
-def _path(location: tuple[int | str, ...]) -> str:
-    # Parts in angle brackets are tags of unions (see problem.py), not keys of the file.
-    keys = (key for key in location if not (isinstance(key, str) and key.startswith("<")))
-    return joined(*(f"[{k}]" if isinstance(k, int) else _key(k) for k in keys))
-
-
-def _key(key: str) -> str:
-    return key if key.isascii() and key.isidentifier() and len(key) <= 64 else shown(key)
-
-
-def bad_input(error: ValidationError) -> BadInput:
-    """Condense a pydantic report into one message: the first fault, and how many more there are."""
-    faults = error.errors(include_url=False)
-    first = faults[0]
-    where = _path(first["loc"])
-    cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, BadInput):
-        where, message = joined(where, cause.where), cause.message
-    elif first["type"] in ("extra_forbidden", "missing"):
-        message = _FIXES[first["type"]]
-    else:
-        fix = _FIXES.get(first["type"])
-        fix = fix.format(**first.get("ctx", {})) if fix else first["msg"]
-        given = first["input"]
-        given = list(given) if isinstance(given, tuple) else given
-        message = f"{shown(given)} is not accepted; {fix}"
-    more = len(faults) - 1
-    if more:
-        message += f" (and {more} more fault{'s' if more > 1 else ''})"
-    return BadInput(message, where)
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
+        """Require what a file must say, though Python has a default for it."""
+        schema: dict[str, Any] = handler(core)
+        model = handler.resolve_ref_schema(schema)
+        required = [key for key in ("format", "kind") if key in model.get("properties", {})]
+        if required:
+            model["required"] = [*required, *model.get("required", [])]
+        return schema

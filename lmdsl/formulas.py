@@ -68,6 +68,8 @@ FORMULA_CONSTANTS: Final[Mapping[str, float]] = MappingProxyType({"pi": math.pi,
 FORMULA_FUNCTIONS: Final[Mapping[str, int]] = MappingProxyType(
     {**{name: ufunc.nin for name, ufunc in _UFUNCS.items()}, "where": 3}
 )
+RESERVED: Final = frozenset({*keyword.kwlist, *FORMULA_FUNCTIONS, *FORMULA_CONSTANTS})
+"""Names that nothing may bear."""
 """Every function of the language and its number of arguments."""
 
 _COMPARE, _SUM, _PRODUCT, _POWER = 1, 2, 3, 4

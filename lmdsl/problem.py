@@ -31,14 +31,13 @@ from lmdsl.declarations import (
     Noise,
     NoiseNormal,
     NoiseValues,
-    Positive,
     Random,
     SamplingUnion,
     Sobol,
     StateBox,
     SystemUnion,
 )
-from lmdsl.declared import Declared
+from lmdsl.declared import Declared, FormulaText, Positive
 from lmdsl.errors import BadInput, shown
 from lmdsl.files import read_json, write_whole
 from lmdsl.formulas import Formula, parse
@@ -64,6 +63,19 @@ __all__ = [
     "load",
     "parse_problem",
 ]
+
+
+class _FileSchema(GenerateJsonSchema):
+    """The schema of what a file may hold: no null."""
+
+    def nullable_schema(self, schema: Any) -> Any:
+        return self.generate_inner(schema["schema"])
+
+    def default_schema(self, schema: Any) -> Any:
+        generated = super().default_schema(schema)
+        if generated.get("default", 0) is None:
+            del generated["default"]
+        return generated
 
 
 class Problem(Declared):
@@ -104,12 +116,22 @@ class Problem(Declared):
     avoid: Avoid | None = None
     control_grid: ControlGrid
     noise: Noise | None = None
-    stage_cost: str
+    stage_cost: FormulaText
     sampling: SamplingUnion
     gamma: Positive = 1.0
     on_exit: Literal["forbid", "clip"] = "forbid"
     measure: Measure | None = None
     local_controller: LocalUnion | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_schema(cls, data: Any) -> Any:
+        """Drop the key by which editors find the JSON Schema of a file."""
+        if not isinstance(data, dict) or "$schema" not in data:
+            return data
+        if not isinstance(data["$schema"], str):
+            raise BadInput(f"{shown(data['$schema'])} is not accepted; write a string", "$schema")
+        return {key: value for key, value in data.items() if key != "$schema"}
 
     @model_validator(mode="after")
     def _consistent(self) -> Problem:
@@ -120,6 +142,20 @@ class Problem(Declared):
         self.cost()
         self.density()
         return self
+
+    @classmethod
+    def model_json_schema(cls, *args: Any, **options: Any) -> dict[str, Any]:
+        """Return the JSON Schema of a problem file; see pydantic for the options."""
+        if len(args) < 3:  # the third is the generator
+            options = {"schema_generator": _FileSchema, **options}
+        return super().model_json_schema(*args, **options)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
+        """Allow the key that editors need, which no problem keeps."""
+        schema = super().__get_pydantic_json_schema__(core, handler)
+        handler.resolve_ref_schema(schema)["properties"]["$schema"] = {"type": "string"}
+        return schema
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -276,9 +312,6 @@ def load(path: str | os.PathLike[str]) -> Problem:
         data = read_json(Path(path))
     except TypeError:
         raise BadInput(f"{shown(path)} is not a path") from None
-    for key in ("format", "system", "state_box", "attractor"):
-        if isinstance(data, dict) and key not in data:
-            raise BadInput("required key is missing; add it", key)
     return parse_problem(data)
 
 
@@ -286,36 +319,15 @@ def parse_problem(data: Any) -> Problem:
     """Validate plain data (the content of a problem file)."""
     if not isinstance(data, dict):
         raise BadInput(f"a problem file holds one JSON object, not {shown(data)}")
+    if "format" not in data:
+        raise BadInput('required key is missing; add "format": "lmdsl/1"', "format")
     problem: Problem = Problem.model_validate(data)
     return problem
 
 
 def json_schema() -> dict[str, Any]:
     """Return the JSON Schema of the problem file, made from the models themselves."""
-    schema = Problem.model_json_schema(schema_generator=_FileSchema)
-    systems = schema["properties"]["system"]["oneOf"]
-    systems[:] = [kind for kind in systems if not kind["$ref"].endswith("/FunctionSystem")]
-    del schema["$defs"]["FunctionSystem"]
-    for model in schema["$defs"].values():
-        if "kind" in model.get("properties", {}):
-            model["required"] = ["kind", *model.get("required", [])]
-    schema["required"] = ["format", *schema["required"]]
+    schema = Problem.model_json_schema()
     schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
     schema["title"] = "lmdsl problem file"
     return schema
-
-
-class _FileSchema(GenerateJsonSchema):
-    """The schema of what a file may hold: no null, no Python function."""
-
-    def nullable_schema(self, schema: Any) -> Any:
-        return self.generate_inner(schema["schema"])
-
-    def default_schema(self, schema: Any) -> Any:
-        generated = super().default_schema(schema)
-        if generated.get("default", 0) is None:
-            del generated["default"]
-        return generated
-
-    def callable_schema(self, schema: Any) -> Any:
-        return {}

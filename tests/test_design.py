@@ -23,6 +23,7 @@ formulas
 intervals
 jets
 program recording
+faults
 declared
 systems.base
 systems.*

@@ -247,7 +247,7 @@ def test_every_key_of_the_problem_file_is_described():
     assert not missing({*keys, *schema["properties"]}, doc("problem-file.md"))
     top = section(doc("problem-file.md"), "## Keys")
     for key, value in schema["properties"].items():
-        (row,) = [line for line in top.splitlines() if re.match(rf"\| \[?`{key}`", line)]
+        (row,) = [line for line in top.splitlines() if re.match(rf"\| \[?`{re.escape(key)}`", line)]
         cells = [cell.strip() for cell in row.split("|")[2:4]]
         assert cells[0] == ("yes" if key in schema["required"] else "no"), key
         if "default" in value and key != "format":

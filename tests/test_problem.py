@@ -360,19 +360,3 @@ def test_named_systems_name_what_they_need():
 def test_kind_comes_first_in_a_saved_file():
     saved = made(standard_map()).to_dict()
     assert all(next(iter(saved[key])) == "kind" for key in ("system", "sampling"))
-
-
-def test_schema_describes_the_file():
-    from jsonschema import Draft202012Validator
-
-    from lmdsl.problem import json_schema
-
-    schema = json_schema()
-    Draft202012Validator.check_schema(schema)
-    validator = Draft202012Validator(schema)
-    for data in (steps(), doubling(), standard_map(), steps(noise=NOISE), *CORNER_CASES):
-        validator.validate(data)
-    for name, data, *_ in BAD:
-        if "unknown" in name or "missing" in name or "string" in name:
-            assert not validator.is_valid(data), name
-    assert "FunctionSystem" not in json.dumps(schema)

@@ -15,9 +15,9 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from lmdsl.declared import Count, Declared, Formulas, Number, Parameters
+from lmdsl.declared import Declared, Formulas, Parameters, Positive, plain
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, Formula, parse
 from lmdsl.jets import Jet
@@ -28,8 +28,7 @@ Array = NDArray[np.float64]
 Step = Callable[..., tuple[Array, ...]]
 """``step(values, check=None)``: images of named arrays; ``check`` as for a program."""
 
-Substeps = Annotated[Count, Field(le=1000)]
-Duration = Annotated[Number, Field(gt=0)]
+Substeps = Annotated[int, Field(strict=True, ge=1, le=1000), BeforeValidator(plain)]
 
 
 def program(
@@ -112,7 +111,7 @@ class OdeSystem(System):
 
     kind: Literal["ode"] = "ode"
     derivative: Formulas
-    step: Duration
+    step: Positive
     substeps: Substeps = 1
 
     def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
@@ -271,7 +270,7 @@ class NamedOde(NamedSystem):
         RK4 steps per sampling time.
     """
 
-    step: Duration = 0.1
+    step: Positive = 0.1
     substeps: Substeps = 1
 
     def definition(self) -> OdeSystem:

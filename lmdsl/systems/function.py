@@ -47,6 +47,11 @@ class FunctionSystem(System):
     kind: Literal["function"] = "function"
     next: Callable[..., Any] = Field(exclude=True)
 
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
+        """Say that no JSON is a function."""
+        return {"not": {}}
+
     def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
         """See :meth:`System.compile`."""
         return FunctionStep(self.next, tuple(states), dict(self.parameters))

@@ -5,7 +5,8 @@ from __future__ import annotations
 from math import pi
 from typing import ClassVar, Literal
 
-from lmdsl.systems.base import Duration, NamedOde, Substeps
+from lmdsl.declared import Positive
+from lmdsl.systems.base import NamedOde, Substeps
 
 
 class InvertedPendulum(NamedOde):
@@ -19,7 +20,7 @@ class InvertedPendulum(NamedOde):
     kind: Literal["inverted_pendulum"] = "inverted_pendulum"
     defaults: ClassVar = {"m": 1.0, "l": 1.0, "g": 9.81, "d": 0.1}
     formulas: ClassVar = {"theta": "omega", "omega": "g/l*sin(theta) + (u - d*omega)/(m*l**2)"}
-    step: Duration = 0.1
+    step: Positive = 0.1
     substeps: Substeps = 2
     summary = "pendulum with a weak motor: swing up by pumping energy, then catch"
     source = (

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from lmdsl.systems.base import Duration, NamedOde, Substeps
+from lmdsl.declared import Positive
+from lmdsl.systems.base import NamedOde, Substeps
 
 
 class Lorenz(NamedOde):
@@ -23,7 +24,7 @@ class Lorenz(NamedOde):
         "y": "x*(rho + u - z) - y",
         "z": "x*y - beta*z",
     }
-    step: Duration = 0.1
+    step: Positive = 0.1
     substeps: Substeps = 5
     summary = "Lorenz system: stabilize steady convection (C+) by adjusting the heating"
     source = (

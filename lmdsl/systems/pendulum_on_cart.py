@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from lmdsl.systems.base import Duration, NamedOde, Substeps
+from lmdsl.declared import Positive
+from lmdsl.systems.base import NamedOde, Substeps
 
 
 class PendulumOnCart(NamedOde):
@@ -23,7 +24,7 @@ class PendulumOnCart(NamedOde):
         "omega": "(g/l*sin(phi) - m/(m + M)/2*omega**2*sin(2*phi) - u*cos(phi)/((m + M)*l))"
         " / (4/3 - m/(m + M)*cos(phi)**2)",
     }
-    step: Duration = 0.1
+    step: Positive = 0.1
     substeps: Substeps = 5
     summary = "inverted pendulum on a cart: the benchmark of set-oriented optimal control"
     source = (

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from lmdsl.systems.base import Duration, NamedOde, Substeps
+from lmdsl.declared import Positive
+from lmdsl.systems.base import NamedOde, Substeps
 
 
 class VanDerPol(NamedOde):
@@ -18,7 +19,7 @@ class VanDerPol(NamedOde):
     kind: Literal["van_der_pol"] = "van_der_pol"
     defaults: ClassVar = {"mu": 1.0}
     formulas: ClassVar = {"x": "v", "v": "mu*(1 - x**2)*v - x + u"}
-    step: Duration = 0.2
+    step: Positive = 0.2
     substeps: Substeps = 4
     summary = "van der Pol oscillator: bring it to rest against its limit cycle"
     source = (
