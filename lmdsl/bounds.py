@@ -3,14 +3,13 @@
 All quantities are nonnegative, so a sum of L products has a relative rounding error of at most
 (L + 1) u, u = 2^-53, whatever its order; with gamma, the cost and the correction itself counted,
 (L + 8) u with a factor 1.1 to spare bounds everything. Products and shares below the normal range
-of doubles lose up to L * 2^-1074 times the largest factor, which is added apart. A row that the
-fast bound leaves open is decided with exact rationals: the doubles G, gamma, V are read as they
-stand and a transition is numerator / total.
+of doubles lose up to L * 2^-1074 times the largest factor, which is added apart. A sum above
+2^1000 bounds nothing. A row that the fast bound leaves open is decided with exact rationals: the
+doubles G, gamma, V are read as they stand and a transition is numerator / total.
 """
 
 from __future__ import annotations
 
-import math
 from fractions import Fraction
 
 import numpy as np
@@ -20,14 +19,16 @@ from lmdsl.bellman import over_cells, padded
 from lmdsl.kernels import kernel
 from lmdsl.linear import Stop, never
 from lmdsl.lp import StabilizationLP
+from lmdsl.sums import LEAST as LEAST
+from lmdsl.sums import UNIT as UNIT
+from lmdsl.sums import rounded_down
 from lmdsl.sweeps import ONE
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
-UNIT = 1.1 * 2.0**-53
-LEAST = 2.0**-1074
-MOST_EXACT_TERMS = 1_000
+LARGEST = 2.0**1000
+"""No sum above is believed: one that rounds to infinity would be above everything."""
 CLEAR, LONG = 1.0 - 1e-12, 4_000
 """Rows of fewer than LONG entries hold where they hold with a factor CLEAR: 4,016 u < 1e-12."""
 MAX_EXACT = 20_000
@@ -72,8 +73,9 @@ def decrease(lp: StabilizationLP, pair: Pairs, w: Floats, g: float) -> Floats | 
 
 def add_above(a: Floats, b: Floats) -> Floats:
     """Return an upper bound of a + b for nonnegative a, b; exact where one is 0."""
-    total = a + b
-    return np.where((a == 0) | (b == 0), total, total * (1 + 4 * UNIT))
+    with np.errstate(over="ignore"):
+        total = a + b
+        return np.where((a == 0) | (b == 0), total, total * (1 + 4 * UNIT))
 
 
 def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Floats:
@@ -163,7 +165,7 @@ def lower_until_below(
             i = int(lp.cell[k])
             bound = exact_backup(lp, int(k), x, gamma, cost)
             if Fraction(float(x[i])) > bound:
-                x[i] = _rounded_down(bound)
+                x[i] = rounded_down(bound)
                 lowered = True
         if not lowered:
             return x
@@ -186,63 +188,10 @@ def raise_from_zero(
     return x
 
 
-def total(values: Floats) -> float:
-    """Return the sum of values >= 0, correctly rounded; infinite where it overflows."""
-    try:
-        return math.fsum(values)
-    except OverflowError:
-        return math.inf
-
-
-def total_above(values: Floats) -> float:
-    """Return an upper bound of the sum of values >= 0, the sum correctly rounded if not many."""
-    if len(values) <= MOST_EXACT_TERMS:
-        return total(values) * (1 + 4 * UNIT)
-    # NumPy adds pairwise: fewer than 64 roundings deep.
-    with np.errstate(over="ignore"):
-        return float(values.sum()) * (1 + 70 * UNIT)
-
-
-def weighted(weight: Floats, values: Floats, direction: float) -> float:
-    """Return weight'values rounded towards ``direction`` (an infinity), for values >= 0.
-
-    Products are split exactly (Dekker) and summed exactly, so the result is the double nearest to
-    the exact sum on the side asked for; sums of very many terms are bounded instead.
-    """
-    top = float(values.max(initial=0.0))
-    if not np.isfinite(top) or top > 1e280:
-        with np.errstate(over="ignore"):
-            rough = total(weight * values)
-        return rough * (1 + math.copysign(4 * UNIT, direction))
-    product = weight * values
-    on = (weight > 0) & (values > 0)
-    count = int(np.count_nonzero(on))
-    if not count:
-        return 0.0
-    if len(product) > MOST_EXACT_TERMS or product[on].min() < 1e-250:  # no longer split exactly
-        # NumPy adds pairwise: fewer than 64 roundings deep, one more for each product.
-        near = float(product.sum())
-        slack = 70 * UNIT * near + count * LEAST
-        return max(float(np.nextafter(near + math.copysign(slack, direction), direction)), 0.0)
-    a, b = _halves(weight), _halves(values)
-    error = ((a[0] * b[0] - product) + a[0] * b[1] + a[1] * b[0]) + a[1] * b[1]
-    terms = [*product.tolist(), *error.tolist()]
-    near = math.fsum(terms)
-    beyond = math.fsum([*terms, -near])  # what rounding to nearest left out
-    outward = beyond > 0 if direction > 0 else beyond < 0
-    return float(np.nextafter(near, direction)) if outward else near
-
-
-def _halves(x: Floats) -> tuple[Floats, Floats]:
-    """Split doubles into two of 26 bits each, whose products are exact."""
-    c = 134217729.0 * x
-    high = c - (c - x)
-    return high, x - high
-
-
-def _rounded_down(value: Fraction) -> float:
-    near = float(value)
-    return near if Fraction(near) <= value else float(np.nextafter(near, -np.inf))
+def ordinary(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> bool:
+    """Return whether the fast bounds of gamma P x + G are sharp: no overflow, no underflow."""
+    top = max(x.max(initial=0.0), 0.0 if cost is None else cost.max(initial=0.0))
+    return tame(lp, x, gamma) and bool(top <= LARGEST / max(gamma, 1.0))
 
 
 def tame(lp: StabilizationLP, V: Floats, gamma: float) -> bool:
@@ -302,6 +251,8 @@ def _careful(k, pointer, target, code, share, gamma, g, V):  # type: ignore[no-u
     if absolute == 0.0:
         return g
     future = gamma * max(q * (1.0 - relative) - absolute, 0.0)
+    if not future <= LARGEST:
+        return g
     return max((future + g) * (1.0 - 4.0 * UNIT) - 2.0 * LEAST, g)
 
 
@@ -312,7 +263,8 @@ def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: 
     for e in range(pointer[k], pointer[k + ONE]):
         q += share[code[e]] * V[target[e]]
     relative = (np.float64(pointer[k + ONE] - pointer[k]) + 8.0) * UNIT
-    below = max((gamma * (q * (1.0 - relative)) + g) * (1.0 - 4.0 * UNIT), g)
+    future = gamma * (q * (1.0 - relative))
+    below = max((future + g) * (1.0 - 4.0 * UNIT), g) if future <= LARGEST else g
     return below if plain else _careful(k, pointer, target, code, share, gamma, g, V)
 
 
@@ -370,7 +322,8 @@ def _open(  # type: ignore[no-untyped-def]
             for e in range(pointer[k], pointer[k + ONE]):
                 q += share[code[e]] * V[target[e]]
             # Most rows hold by far more than rounding: no bound of their own for them.
-            if plain and V[i] <= (gamma * q + g) * CLEAR and pointer[k + ONE] - pointer[k] < LONG:
+            sure = (gamma * q + g) * CLEAR
+            if plain and V[i] <= sure <= LARGEST and pointer[k + ONE] - pointer[k] < LONG:
                 continue
             if V[i] > _bound_below(k, pointer, target, code, share, gamma, g, V, plain):
                 if count < len(found):

@@ -25,13 +25,16 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bounds, policy, rational, threads
+from lmdsl import bounds, policy, rational, sums, threads
 from lmdsl.lp import StabilizationLP
+from lmdsl.sums import rounded_up, total_above
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
 
 MEASURE_TOLERANCE = 1e-9
+MOST_EXACT = 200_000
+"""Transitions of a policy that are judged exactly where numbers are extreme: 0.5 s a claim."""
 MANY = 10_000
 """Cells from which on two claims are judged in two threads."""
 CLAIMS = ("stabilizing", "upper_bound", "lower_bound", "measure")
@@ -112,26 +115,37 @@ class Verified:
 
 
 def check_stabilizing(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
-    """Claim 1: return the proved contraction 1 - min d/w < 1, None where it does not hold."""
-    d = bounds.decrease(lp, pair, w, lp.growth)
-    if d is None or not len(w):
+    """Claim 1: return a proved bound on rho(g P_u), None where the claim does not hold.
+
+    It is 1 - min d/w < 1 rounded up, which may be 1.
+    """
+    if not len(w):
         return None
-    share = float((d / w).min()) * (1 - 4 * bounds.UNIT)
-    contraction = float(np.nextafter(1 - share, 2.0))
-    return max(contraction, 0.0) if contraction < 1 else None
+    d = bounds.decrease(lp, pair, w, lp.growth)
+    if d is not None:
+        share = float((d / w).min()) * (1 - 4 * bounds.UNIT)
+        contraction = float(np.nextafter(1 - share, 2.0))
+        if contraction < 1:
+            return max(contraction, 0.0)
+    exactly = _extreme(lp, pair, w, lp.growth, None)
+    found = None if exactly is None else rational.contraction(lp, _rows(lp, pair), exactly)
+    return None if found is None or found >= 1 else rounded_up(found)
 
 
 def check_upper(lp: StabilizationLP, pair: Pairs, V_up: Floats) -> bool:
     """Claim 2: V_up >= gamma P_u V_up + G_u and V_up >= 0."""
-    if V_up.shape != (lp.n,) or not (np.isfinite(V_up).all() and (V_up >= 0).all()):
+    if not is_sound(lp, V_up):
         return False
     future = bounds.expected_above(lp, pair, V_up, lp.gamma)
-    return bool((V_up >= bounds.add_above(future, lp.cost[pair])).all())
+    if (V_up >= bounds.add_above(future, lp.cost[pair])).all():
+        return True
+    V = _extreme(lp, pair, V_up, lp.gamma, lp.cost)
+    return V is not None and rational.above_policy(lp, _rows(lp, pair), pair, V)
 
 
 def check_lower(lp: StabilizationLP, W: Floats) -> bool:
     """Claim 3: W <= gamma P_a W + G_a for every surviving pair."""
-    if W.shape != (lp.n,) or not (np.isfinite(W).all() and (W >= 0).all()):
+    if not is_sound(lp, W):
         return False
     return bounds.holds_for_all(lp, W, lp.gamma, lp.cost)
 
@@ -142,26 +156,24 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> tuple[float, 
     The residual is infinite where mu is not >= 0. Where rounding alone decides, or a number
     overflows, small models are summed exactly.
     """
-    if mu.shape != (lp.n,) or not (np.isfinite(mu).all() and (mu >= 0).all()):
+    if not is_sound(lp, mu):
         return math.inf, False
     with np.errstate(over="ignore", invalid="ignore"):
         inflow, relative, absolute = bounds.inflow(lp, pair, mu, lp.gamma)
         rounding = relative * (lp.weight + mu + inflow) + absolute
         residual = np.abs((lp.weight - mu) + inflow)
         size = float(mu.sum()) * (1 - 70 * bounds.UNIT)
-    finite = math.isfinite(size) and bool(np.isfinite(residual).all())
+        bound = total_above(residual + rounding)
     allowed = MEASURE_TOLERANCE * max(1.0, size) * (1 - 4 * bounds.UNIT)
-    bound = bounds.total_above(residual + rounding) if finite else math.inf
     if bound <= allowed < math.inf:
         return bound, True
-    hopeful = not finite or bound - 2 * bounds.total_above(rounding) <= allowed
+    least = bound - 2 * total_above(rounding)
     entries = lp.rows.pointer[pair + 1] - lp.rows.pointer[pair]
-    if hopeful and entries.sum() <= bounds.MAX_EXACT:
-        policy_rows = (row for _, row in rational.rows(lp, pair))
-        exactly = [*map(Fraction, mu.tolist())]
-        found = rational.residual(lp, policy_rows, exactly)
-        return rational.rounded_up(found), found <= allowed_residual(exactly)
-    return bound, False
+    if entries.sum() > MOST_EXACT or allowed < least < math.inf:
+        return (bound if math.isfinite(bound) else math.inf), False
+    exactly = rational.fractions(mu)
+    found = rational.residual(lp, _rows(lp, pair), exactly)
+    return rounded_up(found), found <= allowed_residual(exactly)
 
 
 def allowed_residual(mu: list[Fraction]) -> Fraction:
@@ -171,9 +183,29 @@ def allowed_residual(mu: list[Fraction]) -> Fraction:
 
 def check_refusal(lp: StabilizationLP, w: Floats) -> bool:
     """Claim 6: w >= 0, w != 0 and w <= gamma P_a w for every surviving pair."""
-    if w.shape != (lp.n,) or not (np.isfinite(w).all() and (w >= 0).all() and (w > 0).any()):
-        return False
-    return bounds.holds_for_all(lp, w, lp.gamma, None)
+    return is_sound(lp, w) and bool(w.any()) and bounds.holds_for_all(lp, w, lp.gamma, None)
+
+
+def is_sound(lp: StabilizationLP, x: Floats) -> bool:
+    """Return whether a vector has a finite number >= 0 for every cell."""
+    return x.shape == (lp.n,) and bool((np.isfinite(x) & (x >= 0)).all())
+
+
+def _extreme(
+    lp: StabilizationLP, pair: Pairs, x: Floats, gamma: float, cost: Floats | None
+) -> list[Fraction] | None:
+    """Return a vector as fractions where the fast check may fail because numbers are extreme.
+
+    None where its word is final, or the rows of the policy are too many.
+    """
+    entries = lp.rows.pointer[pair + 1] - lp.rows.pointer[pair]
+    if not is_sound(lp, x) or bounds.ordinary(lp, x, gamma, cost) or entries.sum() > MOST_EXACT:
+        return None
+    return rational.fractions(x)
+
+
+def _rows(lp: StabilizationLP, pair: Pairs) -> list[rational.Row]:
+    return [row for _, row in rational.rows(lp, pair)]
 
 
 def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
@@ -209,9 +241,10 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
         contraction, upper = claims
     lower = W is not None and check_lower(lp, W)
     if upper and V_up is not None:
-        cost = bounds.weighted(lp.weight, V_up, math.inf)
+        cost = sums.weighted(lp.weight, V_up, math.inf)
+        upper = cost < math.inf
     if lower and W is not None:
-        floor = bounds.weighted(lp.weight, W, -math.inf)
+        floor = sums.weighted(lp.weight, W, -math.inf)
     certificate = Certificate(
         stabilizing=contraction is not None,
         upper_bound=upper,
@@ -219,18 +252,25 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
         measure=residual is not None and residual[1],
         refusal=pair is None and w is not None and check_refusal(lp, w),
         contraction=contraction,
-        cost=cost,
+        cost=cost if upper else None,
         lower=floor,
         gap=gap(lp, V_up, W) if upper and lower else None,
         measure_residual=None if residual is None else residual[0],
         tolerance=tolerance,
     )
-    return explained(lp, pair, certificate)
+    return explained(lp, pair, with_stated_gap(certificate))
+
+
+def with_stated_gap(proof: Certificate) -> Certificate:
+    """Return a certificate with at least the gap that its rounded cost and lower bound show."""
+    if proof.gap is None or proof.cost is None or proof.lower is None:
+        return proof
+    return replace(proof, gap=sums.stated_gap(proof.gap, proof.cost, proof.lower))
 
 
 def weighted(lp: StabilizationLP, values: Floats) -> float:
     """Return m'values, rounded to nearest."""
-    return bounds.total(lp.weight * values)
+    return sums.total(lp.weight * values)
 
 
 def is_policy(lp: StabilizationLP, pair: Pairs) -> bool:
@@ -269,8 +309,18 @@ def explained(lp: StabilizationLP, pair: Pairs | None, certificate: Certificate)
         if width is not None and width > certificate.tolerance:
             reasons.append(
                 f"the gap {width:.3g} is above the tolerance {certificate.tolerance:.3g}"
+                + _too_small(certificate.cost)
             )
     return replace(certificate, reasons=tuple(reasons))
+
+
+def _too_small(cost: float | None) -> str:
+    if cost is None or not cost < sums.NORMAL:
+        return ""
+    return (
+        f": the cost {cost!r} is below the normal range of doubles, which are coarse there; "
+        "multiply stage_cost by a power of ten"
+    )
 
 
 def _not_stabilizing(lp: StabilizationLP, pair: Pairs) -> str:
@@ -289,8 +339,4 @@ def gap(lp: StabilizationLP, V_up: Floats | None, W: Floats | None) -> float:
     """Return m'(V_up - W) / m'V_up, rounded up; 0 if m'V_up = 0, infinite if one is missing."""
     if V_up is None or W is None:
         return math.inf
-    cost = bounds.weighted(lp.weight, V_up, math.inf)
-    if cost == 0:
-        return 0.0
-    width = bounds.weighted(lp.weight, np.maximum(V_up - W, 0.0), math.inf)
-    return width / cost * (1 + 8 * bounds.UNIT)
+    return sums.gap_above(lp.weight, V_up, W)

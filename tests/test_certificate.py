@@ -239,7 +239,7 @@ def test_certificate_never_imports_a_backend():
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10**6), decades=st.sampled_from([0, 3, 200]))
 def test_directed_sums_are_exact(seed, decades):
-    from lmdsl.bounds import weighted
+    from lmdsl.sums import weighted
 
     rng = np.random.default_rng(seed)
     m = rng.random(7)

@@ -43,8 +43,8 @@ local_check
 transitions
 graph
 lp
-bellman rational
-screening
+bellman sums
+screening rational
 bounds
 policy growth
 feasibility elimination
