@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import replace
 from itertools import count
@@ -36,10 +37,11 @@ def test_our_backends_keep_the_contract(spec):
 
 
 def test_osqp_is_honest_where_it_does_not_converge():
-    # A first-order method: its own iteration limit, said as such, on two of the LPs.
+    # A first-order method: its own iteration limit on two of the LPs, said as such or, through
+    # CVXPY before 1.7, as a failure.
     failed = check_backend("cvxpy:osqp", raise_on_failure=False).failed
     assert {check.name for check in failed} <= {"gamma under", "zeros in the cost"}
-    assert all("stops with ITERATION_LIMIT" in check.reason for check in failed)
+    assert all(re.search("stops with (ITERATION_LIMIT|FAILED)", check.reason) for check in failed)
 
 
 @pytest.mark.parametrize("spec", [*(s for s in SPECS if "hipo" not in s), "cvxpy:osqp"])

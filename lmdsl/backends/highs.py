@@ -102,8 +102,7 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
 def _choose(highs: Any, options: Options, seconds: float | None) -> None:
     algorithm = options.algorithm or next(iter(ALGORITHMS))
     for name, word in ALGORITHMS[algorithm].items():
-        older = {"ipx": "ipm"}.get(word, word)  # what highspy before 1.12 calls it
-        if not (_accepted(highs, name, word) or _accepted(highs, name, older)):
+        if not _accepted(highs, name, word):
             raise MissingDependency(  # HiGHS itself would go on, with simplex
                 f"this highspy has no {algorithm}; install highspy[extras] or a newer highspy, or "
                 "use highs:simplex",
