@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import contextlib
 import os
 import signal
 import sys
@@ -23,6 +24,7 @@ def run() -> int:
     are written whole or not at all, so the process can be ended at any moment.
     """
     global _ended
+    os.environ.pop("MPLBACKEND", None)  # a notebook's; figures are drawn into files
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
     try:
@@ -30,10 +32,12 @@ def run() -> int:
 
         return main()
     except KeyboardInterrupt:  # before main() could take care of it
-        print("lmdsl: interrupted", file=sys.stderr)
+        _say_interrupted()
         return 130
     finally:
         _ended = True
+        with contextlib.suppress(OSError):  # what libraries say when the process ends
+            os.dup2(2, 1)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -44,8 +48,13 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 def _end() -> None:
     time.sleep(PATIENCE)
     if not _ended:  # else it was said
-        os.write(2, (b"\r\x1b[K" if os.isatty(2) else b"") + b"lmdsl: interrupted\n")
+        _say_interrupted()
     os._exit(130)
+
+
+def _say_interrupted() -> None:
+    with contextlib.suppress(OSError):
+        os.write(2, (b"\r\x1b[K" if os.isatty(2) else b"") + b"lmdsl: interrupted\n")
 
 
 if __name__ == "__main__":

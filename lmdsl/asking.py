@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import backends, elimination, policy
+from lmdsl import backends, elimination, policy, quiet
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.scaled import failure
 from lmdsl.deadline import Deadline
@@ -29,8 +29,8 @@ MOST_ITERATIONS = 2**53
 
 def ask(
     lp: StabilizationLP, backend: Backend, options: Options
-) -> tuple[Solution, policy.Iteration | None]:
-    """Ask a backend; whatever it raises or returns, a well-formed solution comes out.
+) -> tuple[Solution, policy.Iteration | None, str]:
+    """Ask a backend; whatever it raises, returns or prints, a well-formed solution comes out.
 
     Returns
     -------
@@ -39,12 +39,24 @@ def ask(
         names a column of each cell's own; parts that are not so are None. ``details`` is empty.
     iteration
         The last step of policy iteration, where it is our own that was asked.
+    log
+        What it printed.
 
     Raises
     ------
     BadInput
         The backend refuses the options, or a package is missing.
     """
+    if backend.capabilities.silent:
+        return *_ask(lp, backend, options), ""
+    progress = options.progress and quiet.ours(options.progress)
+    with quiet.foreign() as printed:
+        return *_ask(lp, backend, replace(options, progress=progress)), printed()
+
+
+def _ask(
+    lp: StabilizationLP, backend: Backend, options: Options
+) -> tuple[Solution, policy.Iteration | None]:
     asked, kept = lp, None
     own = backends.ours(backend)
     try:

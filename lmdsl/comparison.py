@@ -11,7 +11,7 @@ import numpy as np
 
 from lmdsl import bellman
 from lmdsl.deadline import TimeLimitReached
-from lmdsl.errors import BadInput, shown
+from lmdsl.errors import BadInput, printable, shown
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.result import Result
@@ -81,7 +81,7 @@ class Comparison:
         lines.insert(1, "  ".join("-" * w for w in widths))
         for result in self.results:
             if result.status != "verified":
-                lines.append(f"{result.backend}: {result.message}")
+                lines.append(printable(f"{result.backend}: {result.message}"))
         if self.agreement:
             a = self.agreement
             lines.append(
@@ -98,7 +98,7 @@ def _row(result: Result) -> tuple[str, ...]:
         return "-" if value is None else format(value, digits)
 
     return (
-        str(result.backend),
+        printable(str(result.backend)),
         result.status,
         number(result.cost, ".10g"),
         number(result.lower_bound, ".10g"),

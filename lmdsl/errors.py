@@ -41,6 +41,13 @@ def shown(value: object, limit: int = 60) -> str:
     return text if len(text) <= 2 * limit else text[: 2 * limit] + "..."
 
 
+def printable(text: str) -> str:
+    """Return text on one line that a terminal shows as it is: control characters are escaped."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 def plain_text(value: object, limit: int = 200) -> str:
     """Return what somebody else's object says of itself: one printable line, whatever it does.
 
@@ -53,5 +60,4 @@ def plain_text(value: object, limit: int = 200) -> str:
         raise
     except BaseException:
         text = f"an unprintable {type.__dict__['__name__'].__get__(type(value))}"
-    text = " ".join(text.split())
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)[:limit]
+    return printable(" ".join(text.split()))[:limit]

@@ -171,6 +171,8 @@ class Result(Report):
         Shape (M, p).
     iterations
         Iterations in the backend's own sense.
+    log
+        What the backend printed, its last 64 KiB; it is printed nowhere and not saved.
     gap_before_polish
         Gap of the backend's own policy, None where nothing could be certified of it.
     lp
@@ -192,6 +194,7 @@ class Result(Report):
     witness: Floats
     control_vectors: Floats
     iterations: int | None = None
+    log: str = ""
     gap_before_polish: float | None = None
     cause: str | None = None
     lp: StabilizationLP | None = None

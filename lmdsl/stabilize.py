@@ -139,7 +139,7 @@ def solve(
     else:
         if progress:
             progress("solve", -1.0)
-        solution, iteration = ask(lp, chosen, options)
+        solution, iteration, job.log = ask(lp, chosen, options)
     outcome = _polish(lp, solution, iteration, first.pair, tolerance, late)
     iteration = None  # the rows of its last policy would stay till the end
     job.solve_seconds = time.perf_counter() - started
@@ -320,6 +320,7 @@ class _Job:
         self.finish = Deadline()
         self.solve_seconds: float | None = None
         self.verify_seconds: float | None = None
+        self.log = ""
 
     def refused(
         self,
@@ -376,6 +377,7 @@ class _Job:
             polish_steps=outcome.steps,
             gap_before_polish=outcome.gap_before,
             iterations=solution.iterations,
+            log=self.log,
         )
 
     def _result(

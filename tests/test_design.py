@@ -18,7 +18,7 @@ PACKAGE = Path(lm.__file__).parent
 ORDER = """
 errors frozen
 kernels
-files staging
+files staging quiet
 formulas
 intervals
 jets
@@ -73,6 +73,8 @@ testing.known testing.report
 testing.probe
 testing.checks
 testing
+cli.streams
+cli.streams
 cli.output
 cli.*
 cli

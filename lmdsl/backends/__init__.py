@@ -11,6 +11,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
 from importlib.util import find_spec
 
+from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.errors import BadInput, MissingDependency, plain_text, shown
 
@@ -166,7 +167,8 @@ def _loaded(name: str, entries: list[EntryPoint]) -> Backend:
     if len(entries) > 1:
         raise BadInput(f"{shown(name)} is offered by {by}; uninstall all but one", "backend")
     try:
-        found = entries[0].load()
+        with quiet.foreign():
+            found = entries[0].load()
     except KeyboardInterrupt:
         raise
     except BaseException as error:
@@ -177,7 +179,8 @@ def _loaded(name: str, entries: list[EntryPoint]) -> Backend:
     if not isinstance(found, Backend):
         raise BadInput(f"{by} offers {shown(name)}, which is no lmdsl.backends.Backend", "backend")
     try:
-        return plain(found)
+        with quiet.foreign():
+            return plain(found)
     except BadInput as error:
         raise BadInput(f"{by} offers {shown(name)}; {error.message}", "backend") from None
 
@@ -202,6 +205,7 @@ def _word(value: object) -> str:
 
 def _found(package: str) -> bool:
     try:
-        return find_spec(package) is not None
+        with quiet.foreign():  # the folder of a dotted name is imported
+            return find_spec(package) is not None
     except (ImportError, ValueError):  # a package inside one that is missing
         return False

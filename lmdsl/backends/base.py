@@ -66,6 +66,8 @@ class Capabilities:
         It is given only the columns that may belong to an optimal policy (elimination.py).
     tolerance, time_limit, iteration_limit
         It respects these options.
+    silent
+        It prints nothing; the output of any other is kept from the user (quiet.py).
     """
 
     algorithms: tuple[str, ...] = ()
@@ -76,6 +78,7 @@ class Capabilities:
     tolerance: bool = True
     time_limit: bool = True
     iteration_limit: bool = True
+    silent: bool = False
     extras: Mapping[str, str] = field(default_factory=dict)
 
 

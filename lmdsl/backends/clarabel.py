@@ -113,5 +113,8 @@ def _stop(word: str, iterations: int, most: int, late: bool) -> Stop:
 
 
 BACKEND = Backend(
-    "clarabel", solve, Capabilities(algorithms=tuple(ALGORITHMS), elimination=True), ("clarabel",)
+    "clarabel",
+    solve,
+    Capabilities(algorithms=tuple(ALGORITHMS), elimination=True, silent=True),
+    ("clarabel",),
 )

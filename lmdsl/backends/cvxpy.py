@@ -13,6 +13,7 @@ from __future__ import annotations
 import warnings
 from typing import Any
 
+from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.errors import BadInput, shown
@@ -80,7 +81,7 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     BadInput
         CVXPY does not find the solver.
     """
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), quiet.foreign():
         warnings.simplefilter("ignore")
         import cvxpy
 
@@ -155,4 +156,4 @@ def _stop(status: str, solver: str, iterations: int | None, most: int | None, la
     return stop
 
 
-BACKEND = Backend("cvxpy", solve, Capabilities(elimination=True), ("cvxpy",))
+BACKEND = Backend("cvxpy", solve, Capabilities(elimination=True, silent=True), ("cvxpy",))

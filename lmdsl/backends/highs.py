@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.errors import MissingDependency
@@ -77,11 +78,13 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     MissingDependency
         This installation of highspy lacks the algorithm.
     """
-    import highspy
+    with quiet.foreign():
+        import highspy
 
     scaled = ScaledLP.of(lp)
-    highs = highspy.Highs()
-    highs.setOptionValue("output_flag", False)
+    with quiet.foreign():  # some versions greet before they can be told not to
+        highs = highspy.Highs()
+        highs.setOptionValue("output_flag", False)
     _choose(highs, options, scaled.seconds_left(options.time_limit))
     if scaled.late(options.time_limit):
         return scaled.too_late()
@@ -140,6 +143,11 @@ def _model(highspy: Any, scaled: ScaledLP) -> Any:
 BACKEND = Backend(
     "highs",
     solve,
-    Capabilities(algorithms=tuple(ALGORITHMS), extras={"hipo": "highspy-extras"}, elimination=True),
+    Capabilities(
+        algorithms=tuple(ALGORITHMS),
+        extras={"hipo": "highspy-extras"},
+        elimination=True,
+        silent=True,
+    ),
     ("highspy",),
 )

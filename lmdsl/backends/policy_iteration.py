@@ -52,5 +52,5 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
 BACKEND = Backend(
     "policy-iteration",
     solve,
-    Capabilities(algorithms=("howard",), vertex=True, rays=True, warm_start=True),
+    Capabilities(algorithms=("howard",), vertex=True, rays=True, warm_start=True, silent=True),
 )

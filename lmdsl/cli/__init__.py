@@ -9,6 +9,7 @@ its module; what a command needs is imported when it runs.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import sys
 from collections.abc import Sequence
@@ -16,28 +17,26 @@ from typing import Any
 
 from lmdsl.cli import feasibility, listing, results, solving
 from lmdsl.cli.output import Arguments, Run, narrated, print_json
+from lmdsl.cli.streams import kept
 from lmdsl.deadline import TimeLimitReached
-from lmdsl.errors import LmdslError, shown
+from lmdsl.errors import LmdslError, printable, shown
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
-    for stream in (sys.stdout, sys.stderr):
-        if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
-    try:
-        parsed = _parser().parse_args(arguments)
-    except SystemExit as stop:
-        return int(stop.code or 0)
+    with kept() as answers:
+        try:
+            with contextlib.redirect_stdout(answers):  # for --help
+                parsed = _parser().parse_args(arguments)
+        except SystemExit as stop:
+            return int(stop.code or 0)
+        return _run(parsed)
+
+
+def _run(parsed: Arguments) -> int:
     try:
         with narrated():
-            status = int(parsed.run(parsed))
-        sys.stdout.flush()
-        return status
-    except BrokenPipeError:
-        # The reader of our output went away: not an error of ours, and nobody to tell.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return int(getattr(parsed, "status", 0))
+            return int(parsed.run(parsed))
     except KeyboardInterrupt:
         return _fail("interrupted", 130)
     except MemoryError:
@@ -54,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _fail(message: str, status: int) -> int:
-    print(f"lmdsl: {message}", file=sys.stderr)
+    print(f"lmdsl: {printable(message)}", file=sys.stderr)
     return status
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json, safe
+from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
+from lmdsl.cli.streams import say
 
 
 def add(command: Command) -> None:
@@ -31,7 +32,7 @@ def _gamma_max(parsed: Arguments) -> int:
     if parsed.json:
         print_json(found.to_dict())
     else:
-        print(found.text())
+        say(found.text())
     return 0 if found.stabilizable else 3
 
 
@@ -51,5 +52,5 @@ def _explain(parsed: Arguments) -> int:
     if parsed.json:
         print_json(found.to_dict())
     else:
-        print("\n".join(safe(line) for line in text.splitlines()))
+        say(text)
     return 0

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lmdsl.cli.output import Arguments, Command, as_json, print_json, safe
-from lmdsl.errors import BadInput, shown
+from lmdsl.cli.output import Arguments, Command, as_json, print_json
+from lmdsl.cli.streams import say
+from lmdsl.errors import BadInput, printable, shown
 
 
 def add(command: Command) -> None:
@@ -38,8 +39,8 @@ def _systems(parsed: Arguments) -> int:
         return 0
     width = max(map(len, NAMED))
     for name, system in NAMED.items():
-        print(f"{name.ljust(width)}  {system.summary}")
-        print(f"{' ' * width}    {system.source}")
+        say(f"{name.ljust(width)}  {system.summary}")
+        say(f"{' ' * width}    {system.source}")
     return 0
 
 
@@ -55,7 +56,7 @@ def _init(parsed: Arguments) -> int:
         raise BadInput(f"{shown(str(path), 200)} exists; remove it or choose another name", "out")
     problem: Problem = Problem.model_validate(NAMED[parsed.name].problem)
     write_whole(path, problem.to_json().encode())
-    print(f"written to {safe(str(path))}; next: lmdsl solve {safe(str(path))} --out out")
+    say(f"written to {printable(str(path))}; next: lmdsl solve {printable(str(path))} --out out")
     return 0
 
 
@@ -76,7 +77,7 @@ def _backends(parsed: Arguments) -> int:
     if parsed.json:
         print_json(listed, indent=2)
         return 0
-    listed = {safe(name): entry for name, entry in listed.items()}
+    listed = {printable(name): entry for name, entry in listed.items()}
     width = max(map(len, listed))
     for name, entry in listed.items():
         if entry["available"]:
@@ -89,7 +90,7 @@ def _backends(parsed: Arguments) -> int:
             ]
             text = ", ".join(shown_names) or "any"
             mark = " (default)" if name == backends.DEFAULT else ""
-            print(f"{name.ljust(width)}  algorithms: {text}{mark}")
+            say(f"{name.ljust(width)}  algorithms: {text}{mark}")
         else:
-            print(f"{name.ljust(width)}  not available: {entry['reason']}")
+            say(f"{name.ljust(width)}  not available: {entry['reason']}")
     return 0

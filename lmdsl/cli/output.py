@@ -1,4 +1,4 @@
-"""What the commands share: one JSON object, text safe for a terminal, a line of progress."""
+"""What the commands share: one JSON object, a line of progress."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from lmdsl.cli.streams import say
+from lmdsl.errors import printable
+
 Arguments = argparse.Namespace
 Run = Callable[[Arguments], int]
 Command = Callable[[str, Run, str], argparse.ArgumentParser]
@@ -22,14 +25,9 @@ def as_json(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--json", action="store_true", help="print one JSON object on stdout")
 
 
-def safe(text: str) -> str:
-    """Return text without control characters, for a terminal."""
-    return "".join(ch if ch.isprintable() else "\N{REPLACEMENT CHARACTER}" for ch in text)
-
-
 def print_json(data: Any, indent: int | None = None) -> None:
     """Print strict JSON."""
-    print(json.dumps(data, allow_nan=False, indent=indent))
+    say(json.dumps(data, allow_nan=False, indent=indent))
 
 
 class Progress:
@@ -62,7 +60,7 @@ class Narrator(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Show a record; a line about kernels goes when they are done."""
-        busy, text = getattr(record, "busy", None), f"lmdsl: {safe(record.getMessage())}\n"
+        busy, text = getattr(record, "busy", None), f"lmdsl: {printable(record.getMessage())}\n"
         if busy is not None:
             text = "\r\x1b[K"
             if busy:

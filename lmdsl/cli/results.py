@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json, safe
+from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
+from lmdsl.cli.streams import say
+from lmdsl.errors import printable
 
 
 def add(command: Command) -> None:
@@ -40,17 +42,16 @@ def _verify(parsed: Arguments) -> int:
 
     with Progress() as progress:
         found = verify(parsed.dir, parsed.exact, progress)
-    parsed.status = 0 if found.holds else 1
     if parsed.json:
         print_json(found.to_dict())
     else:
-        print(f"{found.status}: " + ("every claim holds" if found.holds else "NOT confirmed"))
+        say(f"{found.status}: " + ("every claim holds" if found.holds else "NOT confirmed"))
         gap = found.certificate.gap
         if gap is not None:
-            print(f"  gap {gap:.2g}, tolerance {found.certificate.tolerance:.2g}")
+            say(f"  gap {gap:.2g}, tolerance {found.certificate.tolerance:.2g}")
         for sentence in (*found.reasons, *found.notes):
-            print(f"  {safe(sentence)}")
-        print("  (claims speak of the finite model: cells and sampled transitions)")
+            say(f"  {printable(sentence)}")
+        say("  (claims speak of the finite model: cells and sampled transitions)")
     return 0 if found.holds else 1
 
 
@@ -64,7 +65,7 @@ def _simulate(parsed: Arguments) -> int:
     if parsed.json:
         print_json(runs.to_dict())
         return 0
-    print(runs.text())
+    say(runs.text())
     return 0
 
 
@@ -75,7 +76,7 @@ def _plot(parsed: Arguments) -> int:
     result = Result.load(parsed.dir)
     path = Path(parsed.out) if parsed.out is not None else Path(parsed.dir) / "figures.png"
     plotting.figure(result, path)
-    print(f"written to {safe(str(path))}")
+    say(f"written to {printable(str(path))}")
     return 0
 
 
@@ -91,5 +92,5 @@ def _export(parsed: Arguments) -> int:
         export_drn(lp, parsed.out)
     else:
         export_certificate(result, parsed.out, lp)
-    print(f"written to {safe(parsed.out)}")
+    say(f"written to {printable(parsed.out)}")
     return 0

@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json, safe
+from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
+from lmdsl.cli.streams import say, tell
+from lmdsl.errors import printable
 
 
 def add(command: Command) -> None:
@@ -65,16 +67,16 @@ def _solve(parsed: Arguments) -> int:
             restrict_to_gamma=parsed.restrict_to_gamma,
             progress=progress,
         )
-    parsed.status = result.exit_status
     saved = parsed.out is not None and result.lp is not None  # else there was no time to compile
+    tell(result.log)
     if saved:
         result.save(parsed.out)
     if parsed.json:
         print_json(result.to_dict())
     else:
-        print(_summary(result))
+        say(_summary(result))
         if saved:
-            print(f"written to {safe(parsed.out)}")
+            say(f"written to {printable(parsed.out)}")
     return result.exit_status
 
 
@@ -91,11 +93,12 @@ def _compare(parsed: Arguments) -> int:
             time_limit=parsed.time_limit,
             progress=progress,
         )
-    parsed.status = comparison.exit_status
+    for result in comparison.results:
+        tell(result.log)
     if parsed.json:
         print_json(comparison.to_dict())
     else:
-        print(comparison.table())
+        say(comparison.table())
     return comparison.exit_status
 
 
@@ -105,9 +108,9 @@ def _summary(result: Any) -> str:
 
     seconds = result.seconds
     rows = [
-        ("problem", safe(result.problem.name) or "(no name)"),
+        ("problem", printable(result.problem.name) or "(no name)"),
         ("status", result.status),
-        ("backend", f"{result.backend} ({result.solver_status or '-'})"),
+        ("backend", printable(f"{result.backend} ({result.solver_status or '-'})")),
         ("cells", f"{result.cells} = {result.attractor_cells} attractor + "
                   f"{result.stabilizable_cells} stabilizable + {_others(result)}"),
         ("pairs", f"{result.pairs} surviving, {result.controls} controls"),
@@ -131,7 +134,7 @@ def _summary(result: Any) -> str:
     rows.append(("seconds", ", ".join(spent) or "-"))
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {value}" for name, value in rows]
-    return "\n".join([*lines, "", safe(result.message)])
+    return "\n".join([*lines, "", printable(result.message)])
 
 
 def _others(result: Any) -> str:

@@ -7,6 +7,7 @@ drawn. A layer takes any matplotlib axes.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.drawing.view import Bools, Floats, View, number, rectangles, segments
-from lmdsl.errors import MissingDependency
+from lmdsl.errors import BadInput, MissingDependency, shown
 from lmdsl.graph import CellStatus
 
 DECADES, DEEPEST = 2, 8
@@ -46,6 +47,8 @@ def blank(columns: float = 1, rows: float = 1) -> Any:
     ------
     MissingDependency
         matplotlib is not installed.
+    BadInput
+        The environment names a backend that this matplotlib does not know.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -53,6 +56,11 @@ def blank(columns: float = 1, rows: float = 1) -> Any:
         from matplotlib.layout_engine import ConstrainedLayoutEngine
     except ImportError:
         raise MissingDependency('plots need matplotlib: pip install "lmdsl[plot]"') from None
+    except ValueError:
+        backend = shown(os.environ.get("MPLBACKEND"))
+        raise BadInput(
+            f"{backend} is no backend of matplotlib here; unset it", "MPLBACKEND"
+        ) from None
     figure = Figure(
         figsize=(4.4 * columns + 0.3, 3.9 * rows + 0.3),
         dpi=110,

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl import backends
+from lmdsl import backends, quiet
 from lmdsl.backends import Solution, Stop
 from lmdsl.errors import BadInput, LmdslError
 from lmdsl.lp import StabilizationLP
@@ -57,7 +57,8 @@ def algorithms(probe: Probe) -> None:
             raise Broken("algorithms are not distinct names")
         return
     try:
-        probe.backend.solve(SMALL.compile(), backends.Options(algorithm=UNKNOWN))
+        with quiet.foreign():
+            probe.backend.solve(SMALL.compile(), backends.Options(algorithm=UNKNOWN))
     except BadInput:
         return
     except Exception as error:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl import quiet
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.scaled import failure
 from lmdsl.errors import LmdslError, MissingDependency
@@ -79,7 +80,8 @@ class Probe:
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                return self.backend.solve(lp, Options(algorithm=self.algorithm, **options))
+                with quiet.foreign():
+                    return self.backend.solve(lp, Options(algorithm=self.algorithm, **options))
         except LmdslError:
             raise
         except BaseException as error:  # solvers written in Rust panic outside Exception

@@ -1,0 +1,223 @@
+"""What solvers print is kept off the standard output of the program that uses lmdsl.
+
+Solvers print from Python, from C and from processes of their own. While foreign code runs, file
+descriptor 1 leads into a temporary file, and so do ``sys.stdout`` and ``sys.stderr`` of the thread
+that runs it; ``print`` in any other thread reaches the user as ever. What other threads write to
+descriptor 1 by other ways meanwhile ends up in the log too, so this is done only where it is
+needed: a backend that is silent by its own options says so (``Capabilities.silent``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import io
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+KEPT = 65_536
+"""Bytes of a log that are kept, the last ones."""
+
+_lock = threading.RLock()
+_here = threading.local()
+_diverted: _Diverted | None = None
+_users = 0
+
+
+@contextlib.contextmanager
+def foreign() -> Iterator[Callable[[], str]]:
+    """Run foreign code: nothing that it prints reaches standard output.
+
+    Yields
+    ------
+    callable
+        Returns what was printed, its last 64 KiB, also after the end.
+    """
+    diverted = _enter()
+    printed: list[str] = []
+    start = diverted.size()
+    _here.depth = _depth() + 1
+    try:
+        yield lambda: printed[0] if printed else diverted.since(start)
+    finally:
+        _here.depth -= 1
+        printed.append(diverted.since(start))
+        _leave()
+
+
+def ours(call: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of the user's that prints where it would outside foreign code."""
+
+    def called(*arguments: Any) -> Any:
+        depth, _here.depth = _depth(), 0
+        try:
+            return call(*arguments)
+        finally:
+            _here.depth = depth
+
+    return called
+
+
+def flush() -> None:
+    """Write out what Python and C hold back for standard output."""
+    for stream in (sys.stdout, sys.__stdout__):
+        with contextlib.suppress(Exception):  # none, closed, or without a reader
+            stream.flush()  # type: ignore[union-attr]
+    for name in ("stdout", "__stdoutp"):
+        with contextlib.suppress(Exception):  # not the C library's name here
+            libc = ctypes.CDLL(None)
+            libc.fflush(ctypes.c_void_p.in_dll(libc, name))
+
+
+def descriptor(stream: Any) -> int | None:
+    """Return the file descriptor of a stream, None where it has none."""
+    try:
+        return int(stream.fileno())
+    except Exception:
+        return None
+
+
+def twin(stream: Any, number: int) -> io.TextIOWrapper:
+    """Return a stream that writes as another does, to another descriptor, which it owns."""
+    return io.TextIOWrapper(
+        os.fdopen(number, "wb"),
+        encoding=getattr(stream, "encoding", None) or "utf-8",
+        errors=getattr(stream, "errors", None) or "backslashreplace",
+        line_buffering=True,
+    )
+
+
+class _Diverted:
+    """Descriptor 1, ``sys.stdout`` and ``sys.stderr`` lead into one temporary file."""
+
+    def __init__(self) -> None:
+        self.kept: int | None = None
+        self.file = _file()
+        self.log = io.TextIOWrapper(self.file, "utf-8", "backslashreplace", write_through=True)
+        self.streams = {"stdout": sys.stdout, "stderr": sys.stderr}
+        self.split: dict[str, _Split] = {}
+        try:
+            self._divert()
+        except BaseException:
+            self.end()
+            raise
+
+    def _divert(self) -> None:
+        users: dict[str, Any] = dict(self.streams)
+        if sys.__stdout__ is not None:  # else descriptor 1 is closed, or somebody's file
+            flush()
+            with contextlib.suppress(OSError):
+                self.kept = os.dup(1)
+                os.dup2(self.file.fileno(), 1)
+        for name, stream in self.streams.items():
+            if self.kept is not None and descriptor(stream) == 1:
+                users[name] = twin(stream, os.dup(self.kept))
+            self.split[name] = _Split(stream, users[name], self.log)
+            setattr(sys, name, self.split[name])
+
+    def end(self) -> None:
+        """Put everything back in its place."""
+        for name, split in self.split.items():
+            if getattr(sys, name) is split:  # else somebody put another there since
+                setattr(sys, name, split.stream)
+            split.end()
+        if self.kept is not None:
+            flush()
+            os.dup2(self.kept, 1)
+            os.close(self.kept)
+            self.kept = None
+        self.log.close()
+
+    def size(self) -> int:
+        """Return how much was printed."""
+        if self.kept is not None:
+            flush()
+        return os.fstat(self.file.fileno()).st_size
+
+    def since(self, start: int) -> str:
+        """Return what was printed since, the last part of it."""
+        end = self.size()
+        first = max(start, end - KEPT)
+        if first >= end or not hasattr(os, "pread"):
+            return ""
+        found = os.pread(self.file.fileno(), end - first, first)
+        return found.decode("utf-8", "backslashreplace")
+
+
+class _Split:
+    """Stands for a standard stream: foreign code's goes to the log, the user's to the user."""
+
+    def __init__(self, stream: Any, user: Any, log: Any) -> None:
+        self.stream, self.user, self.log = stream, user, log
+
+    def _target(self) -> Any:
+        return self.log if _depth() and self.log is not None else self.user
+
+    def write(self, text: str) -> int:
+        with _lock:
+            target = self._target()
+            return len(text) if target is None else target.write(text)
+
+    def flush(self) -> None:
+        with _lock:
+            target = self._target()
+            if target is not None:
+                target.flush()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._target(), name)
+
+    def end(self) -> None:
+        """Be the stream stood for from now on: somebody may have kept this object."""
+        with _lock:
+            user, self.user, self.log = self.user, self.stream, None
+            if user is not self.stream:
+                with contextlib.suppress(Exception):
+                    user.close()
+
+
+def _file() -> Any:
+    try:
+        return tempfile.TemporaryFile(buffering=0)
+    except OSError:  # nowhere to write
+        return open(os.devnull, "w+b", buffering=0)
+
+
+def _depth() -> int:
+    return getattr(_here, "depth", 0)
+
+
+def _enter() -> _Diverted:
+    global _diverted, _users
+    with _lock:
+        if _diverted is None:
+            _diverted = _Diverted()
+        _users += 1
+        return _diverted
+
+
+def _leave() -> None:
+    global _diverted, _users
+    with _lock:
+        _users -= 1
+        if not _users and _diverted is not None:
+            _diverted.end()
+            _diverted = None
+
+
+def _forked() -> None:
+    """Of the threads that were in foreign code the child has at most the one that forked."""
+    global _diverted, _users, _lock
+    _lock = threading.RLock()
+    _users = min(_depth(), 1)
+    if not _users and _diverted is not None:
+        _diverted.end()
+        _diverted = None
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forked)
