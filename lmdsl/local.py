@@ -8,12 +8,14 @@ of the control grid. Together they are the paper's feedback: C0 near the attract
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl import riccati
 from lmdsl.declarations import ConstantControl, LinearFeedback, LqrFeedback
 from lmdsl.errors import BadInput
 from lmdsl.intervals import Interval
@@ -99,7 +101,8 @@ class LocalController:
         _inside(orbit, partition, attractor)
         mean = _mean_noise(noise_nodes(problem))
         _refuse_unless_orbit(problem, partition, orbit, control, mean)
-        jacobian = _jacobian(problem, orbit, control, mean)
+        width, reach = partition.width, _reach(values, control)
+        jacobian = _jacobian(problem, orbit, control, mean, np.concatenate([width, reach]))
         A, B = jacobian[:, :, :d], jacobian[:, :, d:]
         smooth = bool(np.isfinite(jacobian).all())
         if isinstance(declared, LinearFeedback):
@@ -110,12 +113,13 @@ class LocalController:
         elif not smooth:
             raise BadInput("the system is not differentiable there", "local_controller.orbit")
         else:
-            gain = _regulator(A, B, *_weights(declared, problem, partition, values, control))
+            scaled = _regulator(A, B, declared, problem, width, reach)
+            gain = scaled * reach[:, None] / width
         multiplier = None
         if smooth:
             product = np.eye(d)
             for k in range(q):
-                product = (A[k] - B[k] @ gain[k]) @ product
+                product = (A[k] - B[k] @ (gain[k] / reach[:, None] * width)) @ product
             multiplier = float(np.abs(np.linalg.eigvals(product)).max())
         return cls(partition, attractor, orbit, control, gain, low, high, multiplier)
 
@@ -196,28 +200,42 @@ def _refuse_unless_orbit(
             )
 
 
-def _jacobian(problem: Problem, orbit: Floats, control: Floats, noise: Floats) -> Floats:
-    """Return the derivatives by states and controls, shape (q, d, d + p); NaN at a kink."""
+def _reach(values: list[Floats], control: Floats) -> Floats:
+    """Return the largest distance from a control of the orbit to a value; 1 where it is 0."""
+    far = [np.abs(v[:, None] - control[None, :, j]).max() for j, v in enumerate(values)]
+    return np.array([float(x) or 1.0 for x in far])
+
+
+def _jacobian(
+    problem: Problem, orbit: Floats, control: Floats, noise: Floats, unit: Floats
+) -> Floats:
+    """Return the derivatives by states and controls, shape (q, d, d + p); NaN at a kink.
+
+    They are per unit of each variable: cell widths, and the reach of the controls.
+    """
     step, q = problem.step(), len(orbit)
     names = (*problem.states, *problem.controls)
     at = np.concatenate([orbit, control], axis=1)
     fixed = {name: np.full(q, noise[j]) for j, name in enumerate(problem.noises)}
     if not hasattr(step, "enclose"):
-        return np.moveaxis(_differences(step, names, at, fixed), 2, 0)
+        return np.moveaxis(_differences(step, names, at, fixed, unit), 2, 0)
     jets = {
         name: Jet.variable(Interval.point(at[:, j]), j, len(names)) for j, name in enumerate(names)
     }
     jets |= {name: Jet.constant(x, len(names)) for name, x in fixed.items()}
     slopes = []
-    with np.errstate(invalid="ignore"):
-        for image in step.enclose(jets):
-            low, high = (np.broadcast_to(end, (len(names), q)) for end in image.slope)
+    with np.errstate(invalid="ignore", over="ignore"):
+        for image, own in zip(step.enclose(jets), unit, strict=False):
+            per = (unit / own)[:, None]
+            low, high = (per * np.broadcast_to(end, (len(names), q)) for end in image.slope)
             sharp = np.isfinite(low) & (high - low <= 1e-6 * (1 + np.abs(low)))
-            slopes.append(np.where(sharp, image.slope.midpoint, np.nan))
+            slopes.append(np.where(sharp, per * image.slope.midpoint, np.nan))
     return np.moveaxis(np.stack(slopes), 2, 0)
 
 
-def _differences(step: Any, names: tuple[str, ...], at: Floats, fixed: dict[str, Floats]) -> Floats:
+def _differences(
+    step: Any, names: tuple[str, ...], at: Floats, fixed: dict[str, Floats], unit: Floats
+) -> Floats:
     """Differentiate a Python function by central differences with Richardson's extrapolation."""
     q = len(at)
 
@@ -228,65 +246,49 @@ def _differences(step: Any, names: tuple[str, ...], at: Floats, fixed: dict[str,
                 name: at[:, i] + (sign * h if i == j else 0.0) for i, name in enumerate(names)
             }
             images.append(np.stack([np.broadcast_to(y, q) for y in step({**values, **fixed})]))
-        return np.asarray((images[0] - images[1]) / (2 * h))
+        own = unit[: len(images[0]), None]
+        return np.asarray((images[0] - images[1]) / own * (unit[j] / (2 * h)))
 
     columns = []
     for j in range(len(names)):
-        h = 1e-4 * max(1.0, float(np.abs(at[:, j]).max()))
+        h = max(1e-2 * float(unit[j]), 1e-5 * float(np.abs(at[:, j]).max()))
         columns.append((4 * central(j, h / 2) - central(j, h)) / 3)
     return np.moveaxis(np.stack(columns), 1, 0)  # (d, d + p, q)
 
 
-def _weights(
-    declared: LqrFeedback,
-    problem: Problem,
-    partition: Partition,
-    values: list[Floats],
-    control: Floats,
-) -> tuple[Floats, Floats]:
-    Q = [
-        declared.state_weights.get(name, 1.0 / float(partition.width[i]) ** 2)
-        for i, name in enumerate(partition.names)
-    ]
-    R = []
-    for j, name in enumerate(problem.controls):
-        reach = float(np.abs(values[j][:, None] - control[None, :, j]).max()) or 1.0
-        R.append(declared.control_weights.get(name, 1.0 / reach**2))
-    return np.array(Q), np.array(R)
-
-
-def _regulator(A: Floats, B: Floats, Q: Floats, R: Floats) -> Floats:
-    """Solve the periodic LQR problem as one Riccati equation in cyclic form.
-
-    The state of the cyclic system holds one block per orbit point; block k moves to block k + 1
-    by A_k, B_k. Its stabilizing solution is block diagonal with the periodic solution X_k (Bittanti
-    and Colaneri, Periodic Systems, 2009), and K_k = (R + B_k' X_{k+1} B_k)^-1 B_k' X_{k+1} A_k.
-    """
-    from scipy.linalg import solve, solve_discrete_are
-
+def _regulator(
+    A: Floats, B: Floats, declared: LqrFeedback, problem: Problem, width: Floats, reach: Floats
+) -> Floats:
+    """Return the gains of the regulator for A, B in units of cell widths and reach of controls."""
     q, d, p = B.shape
     where = "local_controller"
     if q * d > MAX_RICCATI:
         raise BadInput(f"{q} points of {d} axes; at most {MAX_RICCATI} in all", f"{where}.orbit")
     if not p:
         return np.zeros((q, 0, d))
-    cyclic_A, cyclic_B = np.zeros((q * d, q * d)), np.zeros((q * d, q * p))
-    for k in range(q):
-        after = (k + 1) % q
-        rows = slice(after * d, (after + 1) * d)
-        cyclic_A[rows, k * d : (k + 1) * d] = A[k]
-        cyclic_B[rows, k * p : (k + 1) * p] = B[k]
+    weights = (
+        np.array([_scaled(given, name, float(by)) for name, by in zip(names, unit, strict=True)])
+        for given, names, unit in (
+            (declared.state_weights, problem.states, width),
+            (declared.control_weights, problem.controls, reach),
+        )
+    )
     try:
-        X = solve_discrete_are(cyclic_A, cyclic_B, np.diag(np.tile(Q, q)), np.diag(np.tile(R, q)))
-        gains = []
-        for k in range(q):
-            after = (k + 1) % q
-            Xk = X[after * d : (after + 1) * d, after * d : (after + 1) * d]
-            gains.append(solve(np.diag(R) + B[k].T @ Xk @ B[k], B[k].T @ Xk @ A[k], assume_a="pos"))
-    except (np.linalg.LinAlgError, ValueError):
+        return riccati.regulator(A, B, *weights)
+    except riccati.Unstabilizable as error:
         raise BadInput(
-            "the controls cannot stabilize the linearisation along the orbit (the Riccati equation "
-            "has no stabilizing solution); choose another orbit, weights or kind",
+            "the controls cannot stabilize the linearisation along the orbit: they do not reach a "
+            f"mode of multiplier {error.multiplier:.6g}; choose another orbit or kind",
             where,
         ) from None
-    return np.stack(gains)
+    except (riccati.Unsolved, np.linalg.LinAlgError):
+        raise BadInput(
+            "the Riccati equation along the orbit could not be solved in doubles; choose weights "
+            "that differ less, or kind linear",
+            where,
+        ) from None
+
+
+def _scaled(given: dict[str, float], name: str, unit: float) -> float:
+    """Return the binary logarithm of a weight per unit squared; by default it is 1."""
+    return math.log2(given[name]) + 2 * math.log2(unit) if name in given else 0.0

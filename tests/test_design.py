@@ -37,7 +37,7 @@ peeling merging leaps
 linear
 partition rows
 boxes lines
-regions sampler
+regions sampler riccati
 local
 local_check
 transitions
