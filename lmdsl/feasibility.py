@@ -60,12 +60,17 @@ def _proved(lp: StabilizationLP, pair: Pairs, w: Floats, stop: Stop) -> Floats |
     """Make of a guess a proof that a policy is g-stabilizing; None where it takes too long.
 
     Where its own value is soon known and every cost positive, it is the proof; else the guess is
-    swept towards the unit-cost value, as long as that is in sight.
+    swept towards the unit-cost value, as long as that is in sight. Else 1 serves where all rows
+    lose mass.
     """
     rows, cost = peeled(lp, pair, lp.growth), lp.cost[pair]
 
     def proves(guess: Floats) -> bool:
         return bounds.decrease(lp, pair, guess, lp.growth) is not None
+
+    def even() -> Floats | None:
+        ones = np.ones(lp.n)
+        return ones if proves(ones) else None
 
     paid = rows.small and bool((cost > 0).all())
     for paid_for in (cost, np.ones(lp.n)) if paid else (np.ones(lp.n),):
@@ -73,7 +78,7 @@ def _proved(lp: StabilizationLP, pair: Pairs, w: Floats, stop: Stop) -> Floats |
         for _ in range(MOST_ROUNDS):
             left = linear.advance(rows, paid_for, proof, SWEEPS, 0.0, 0.25)
             if left == np.inf:
-                return None
+                return even()
             if proves(proof):
                 return proof
             if left > 0.3 * before or left <= TOLERANCE:
@@ -83,7 +88,7 @@ def _proved(lp: StabilizationLP, pair: Pairs, w: Floats, stop: Stop) -> Floats |
             before = left
         if left > TOLERANCE and linear.lift(rows, paid_for, proof) and proves(proof):
             return proof
-    return None
+    return even()
 
 
 def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused | Undecided:

@@ -9,7 +9,7 @@ grow over hundreds of decades, costs one pass.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import bounds, linear
+from lmdsl.directions import Directions
 from lmdsl.kernels import kernel
 from lmdsl.linear import Stop, never
 from lmdsl.lp import StabilizationLP
+from lmdsl.sweeps import System
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
@@ -29,6 +31,12 @@ TIED = 1e-6
 
 LEAST_ENTRY = 1e-250
 """Least entry of the vector of a class whose largest is 1."""
+
+SLOWER = 1e-3
+"""How much slower than the slowest class one is known to be before its exact rate is left open."""
+
+STEPS = 100
+"""Steps of Noda's iteration, at most."""
 
 SMALLEST, LARGEST = 1e-280, 1e300
 """Range of w."""
@@ -82,35 +90,44 @@ def of_policy(lp: StabilizationLP, pair: Pairs, stop: Stop = never) -> Growth:
     order, ends = linear.classes(P)
     x, rate = np.ones(lp.n), P.diagonal()
     lengths = np.diff(ends, prepend=0)
-    for k in np.flatnonzero(lengths > 1):
-        cells = order[ends[k] - lengths[k] : ends[k]]
-        x[cells], rate[cells] = _perron(P[cells][:, cells], stop)
+    several = np.flatnonzero(lengths > 1)
+    slowest = float(rate[order[ends[lengths == 1] - 1]].max(initial=0.0))
+    for k in several[np.argsort(lengths[several], kind="stable")]:
+        cells = np.sort(order[ends[k] - lengths[k] : ends[k]])
+        directions = lp.directions.among(cells) if len(cells) >= linear.KRYLOV else None
+        x[cells], rate[cells], least = _perron(P[cells][:, cells], stop, slowest, directions)
+        slowest = max(slowest, least)
     return Growth(pair, P, order, ends, x, rate)
 
 
-def _perron(inner: Any, stop: Stop, steps: int = 100) -> tuple[Floats, float]:
-    """Return x > 0 and the largest (M x)_i / x_i for an irreducible M >= 0, close to rho(M).
+def _perron(
+    inner: Any, stop: Stop, slowest: float = 0.0, directions: Directions | None = None
+) -> tuple[Floats, float, float]:
+    """Return x > 0, the largest (M x)_i / x_i, and the least, for an irreducible M >= 0.
 
     For a bound at > rho, y = (I - M/at)^-1 x is positive and (M y)_i / y_i < at. Noda's iteration
     takes for ``at`` the largest (M x)_i / x_i so far: it falls to rho, quadratically in the end.
     Where it falls slowly, as it does if x spans many decades, ``at`` is taken halfway down to a
     lower bound: the least (M x)_i / x_i, or an ``at`` that gave no positive y. Whatever x > 0 it
-    ends with, max (M x)_i / x_i >= rho holds.
+    ends with, max (M x)_i / x_i >= rho holds. It ends early where that is below ``slowest``, the
+    rate of another class. In a large class, with its ``directions``, y is found by Krylov's method;
+    a y that is not exact only takes a step more.
     """
     n = inner.shape[0]
     dense = inner.toarray() if n <= linear.DENSE else None
     M = inner if dense is None else dense
+    slow_fall = 0.1 if directions is None else 0.9
     x = np.ones(n)
     ahead = M @ x
     top, bottom = float(ahead.max()), float(ahead.min())
-    halve = False
-    for _ in range(steps):
+    least, halve = bottom, False
+    for _ in range(STEPS):
         width = top - bottom
-        if width <= 1e-11 * top:
+        if width <= 1e-11 * top or top < slowest * (1 - SLOWER):
             break
         # A little off top, so that the last steps are not singular.
         at = (top + bottom) / 2 if halve else top * (1 + 1e-9)
-        y = _solved(M / at, x, stop)
+        y = _solved(M / at, x, stop, directions)
         if y is None:
             if not halve:
                 break
@@ -118,26 +135,29 @@ def _perron(inner: Any, stop: Stop, steps: int = 100) -> tuple[Floats, float]:
             continue
         ahead_y = M @ y
         ratio = ahead_y / y
-        bottom = max(bottom, float(ratio.min()))
+        least = max(least, float(ratio.min()))
+        bottom = max(bottom, least)
         if ratio.max() < top:
             x, top = y, float(ratio.max())
         elif not halve:
             break
         else:
             bottom = at  # rounding ends here
-        halve = not top - bottom < 0.1 * width
-    return x, top
+        halve = not top - bottom < slow_fall * width
+    return x, top, least
 
 
-def _solved(M: Any, x: Floats, stop: Stop) -> Floats | None:
+def _solved(M: Any, x: Floats, stop: Stop, directions: Directions | None) -> Floats | None:
     """Return y = x + M y, largest entry 1, None where it is not positive or leaves doubles."""
     if isinstance(M, np.ndarray):
         try:
             y: Any = np.linalg.solve(np.eye(len(x)) - M, x)
         except np.linalg.LinAlgError:
             return None
-    else:
+    elif directions is None:
         y = linear.solve(M, x, stop=stop)
+    else:
+        y = linear.guess(replace(System.of(M), directions=directions), x, stop)
     if y is None or not np.isfinite(y).all() or not y.min() > 0:
         return None
     y = x + M @ y  # sums of positive numbers: every entry to its own precision

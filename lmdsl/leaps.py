@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.kernels import kernel
 from lmdsl.sweeps import CEILING, System
 
 Floats = NDArray[np.float64]
@@ -68,15 +67,4 @@ def lift(system: System, b: Floats, x: Floats) -> bool:
 
 def _moved(system: System, v: Floats) -> Floats:
     """Return D^-1 (M - own) v with D = 1 - own, own the diagonal of M: one Jacobi step."""
-    out = np.empty(len(v))
-    _off_diagonal(system.begin, system.end, system.indices, system.data, v, out)
-    return system.inverse * out
-
-
-@kernel
-def _off_diagonal(begin, end, indices, data, v, out):  # type: ignore[no-untyped-def]
-    for i in range(np.uint64(len(begin))):
-        y = 0.0
-        for e in range(begin[i], end[i]):
-            y += data[e] * v[indices[e]]
-        out[i] = y
+    return system.inverse * system.times(v)

@@ -164,6 +164,30 @@ def advance(peeled: Peeled, b: Floats, x: Floats, count: int, enough: float, fla
     return change if peeled.substitute(b, x) else np.inf
 
 
+def descend(peeled: Peeled, b: Floats, x: Floats, enough: float, stop: Stop = never) -> bool:
+    """Lower x >= b + M x in place, b > 0, by a Krylov method; False where that fails.
+
+    Its y is close to the solution, not above b + M y. With r = b + M y - y and t >= max(r / b),
+    y + t x is: (I - M)(y + t x) >= b - r + t b.
+    """
+    whole = not peeled.small
+    system, c = (peeled.system, b) if whole else (peeled.inner, b[peeled.core])
+    v = x if whole else x[peeled.core]
+    if len(v):
+        y = _krylov(system, c, v, stop, max(enough, 1e-13))
+        if y is None:
+            return False
+        system.sweep(c, y, len(system.directions.cycle))
+        share = float((system.residual(c, y) / (system.inverse * c)).max(initial=0.0))
+        y += share * (1 + 1e-9) * v
+        if not (y < CEILING).all():
+            return False
+        np.minimum(v, y, out=v)
+        if not whole:
+            x[peeled.core] = v
+    return whole or peeled.substitute(b, x)
+
+
 def lift(peeled: Peeled, b: Floats, x: Floats) -> bool:
     """Raise x in place to x >= b + M x, along the slowest mode; False where that fails.
 
@@ -219,7 +243,17 @@ def _solve(
     return None
 
 
-def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
+def guess(system: System, b: Floats, stop: Stop = never) -> Floats | None:
+    """Return x close to b + M x by a Krylov method and sweeps alone; None where it breaks down."""
+    x = _krylov(system, b, b.copy(), stop)
+    if x is not None:
+        system.sweep(b, x, TRIAL_SWEEPS // 3)
+    return x
+
+
+def _krylov(
+    system: System, b: Floats, x: Floats, stop: Stop, enough: float = 1e-13
+) -> Floats | None:
     """Return a better guess by BiCGSTAB (van der Vorst 1992), None where it breaks down.
 
     A cycle of sweeps in all directions maps x to S x + s; it solves x - S x = s, in one step for
@@ -242,7 +276,7 @@ def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
         if not 0 < unit < CEILING:
             return None
         known, steps = swept(b / unit, zero), min(KRYLOV_STEPS, KRYLOV_SWEEPS // (2 * count))
-        y = _bicgstab(lambda v: v - swept(zero, v), known, x / unit, steps, stop)
+        y = _bicgstab(lambda v: v - swept(zero, v), known, x / unit, steps, stop, enough)
         guess = np.maximum(unit * y, b)
     if not (guess < CEILING).all() or y.min() < -1e-9 * y.max():
         return None
@@ -250,9 +284,14 @@ def _krylov(system: System, b: Floats, x: Floats, stop: Stop) -> Floats | None:
 
 
 def _bicgstab(
-    applied: Callable[[Floats], Floats], b: Floats, x: Floats, steps: int, stop: Stop
+    applied: Callable[[Floats], Floats],
+    b: Floats,
+    x: Floats,
+    steps: int,
+    stop: Stop,
+    enough: float,
 ) -> Floats:
-    """Solve applied(x) = b to 13 digits, or make so many steps."""
+    """Solve applied(x) = b to a relative residual ``enough``, or make so many steps."""
 
     def dot(u: Floats, v: Floats) -> Any:
         return (u * v).sum()
@@ -260,9 +299,9 @@ def _bicgstab(
     x = np.where(np.isfinite(x), x, 0.0)
     r = b - applied(x)
     shadow, p, rho = r, r, dot(r, r)
-    enough = 1e-26 * dot(b, b)
+    least = enough * enough * dot(b, b)
     for _ in range(steps):
-        if not dot(r, r) > enough or rho == 0.0:
+        if not dot(r, r) > least or rho == 0.0:
             break
         if stop():
             raise Stopped

@@ -38,6 +38,14 @@ FEW = 500
 """Changes in fewer than one of so many cells: another pass costs less than evaluating them."""
 
 
+PATIENCE = 200
+"""Sweeps in evaluations that did not come to their end before a Krylov method takes their place."""
+
+
+PROBES = 64
+"""Rows looked at before all are."""
+
+
 def evaluate(
     lp: StabilizationLP,
     pair: Pairs,
@@ -169,6 +177,7 @@ def iterate(
     rows: Peeled | None = None  # those of the policy at hand
     V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
     hasty = False  # the policy at hand was not evaluated at all
+    swept = 0  # sweeps that did not reach the end
     stalls = True  # sweeps do, in a single mode, as far as was seen
     while True:
         out = stop() or step == limit
@@ -189,9 +198,16 @@ def iterate(
                 if stalls and not rows.small:
                     far = leaps.leap(rows.system, screen.paid, x)
                     stalls = 2 * far > sweeps
-                if far < sweeps:
-                    left = linear.advance(rows, screen.paid, x, sweeps, 0.1 * fall, 0.0)
                 paid = bool((screen.paid > 0).all())  # else what is free has to become 0
+                slow = swept > PATIENCE and paid
+                if slow:
+                    enough = 0.1 * (fall or _fall(V, x))
+                    slow = linear.descend(rows, screen.paid, x, enough, stop)
+                    swept = swept if slow else 0
+                if far < sweeps and not slow:
+                    left = linear.advance(rows, screen.paid, x, sweeps, 0.1 * fall, 0.0)
+                    if left > TOLERANCE and left > 0.1 * (fall or _fall(V, x)):
+                        swept += sweeps
                 exact = x if left <= TOLERANCE and paid else None
                 x = np.minimum(x, done.value)
             screen.follow(V, x)
@@ -228,22 +244,48 @@ def _fall(before: Floats, after: Floats) -> float:
 def bound(lp: StabilizationLP, pair: Pairs, w: Floats | None = None) -> Floats | None:
     """Return V >= T_u V of a g-stabilizing policy, close to its value; None where none is found.
 
-    With w >= g P_u w + d, c w serves as soon as c d >= G_u; sweeps then lower it.
+    With w >= g P_u w + d, c w serves as soon as c d >= G_u; sweeps then lower it. Where all rows
+    lose about as much of what is paid, a constant is close already.
     """
+    cost = lp.cost[pair]
+    even = _even(lp, pair, lp.gamma, cost)
+    if even is not None:
+        return even
     w, d = stability_vector(lp, pair, w)
     if w is None or d is None:
         return None
-    cost = lp.cost[pair]
-    with np.errstate(over="ignore"):
-        factor = float((cost / d).max()) * (1 + 1e-12)
-        V: Floats = w * factor
-    if not (V < CEILING).all():
-        return None
-    if bool((d * (factor * (1 - 1e-2)) <= cost).all()):
-        return V  # within a percent of the value at weight g already
+    V = _covering(w, d, cost)
+    if V is None or _close(V[0] / w[0], d, cost):
+        return V
     x = V.copy()
     linear.advance(peeled(lp, pair, lp.gamma), cost, x, MOST_SWEEPS, 1e-2, 0.0)
     return np.minimum(x, V)
+
+
+def _even(lp: StabilizationLP, pair: Pairs, gamma: float, cost: Floats) -> Floats | None:
+    """Return a constant V >= T_u V within a percent of the policy's value, None where none is."""
+    some = np.arange(0, lp.n, lp.n // PROBES + 1)  # few have to be looked at where none is
+    rows = lp.rows.take(pair[some])
+    stays = np.where(rows.target < lp.n, rows.shares.value[rows.code], 0.0)
+    d = 1 - gamma * np.add.reduceat(stays, rows.pointer[:-1])
+    if not ((d > 0).all() and _close(float((cost[some] / d).max()), d, cost[some])):
+        return None
+    ones = np.ones(lp.n)
+    lost = bounds.decrease(lp, pair, ones, gamma)
+    V = None if lost is None else _covering(ones, lost, cost)
+    return V if V is not None and lost is not None and _close(V[0], lost, cost) else None
+
+
+def _covering(w: Floats, d: Floats, cost: Floats) -> Floats | None:
+    """Return the least c w with c d >= cost, None where doubles end."""
+    with np.errstate(over="ignore"):
+        V: Floats = w * (float((cost / d).max()) * (1 + 1e-12))
+    return V if (V < CEILING).all() else None
+
+
+def _close(factor: float, d: Floats, cost: Floats) -> bool:
+    """Return whether c w is within a percent of a policy's value, for w >= g P_u w + d."""
+    return bool((d * (factor * (1 - 1e-2)) <= cost).all())
 
 
 def canonical(
@@ -285,7 +327,9 @@ def canonical(
     owned = columns[start] == pair[inside]
     if not owned.all():
         start = np.where(owned, start, sub.tree[1])
-    w = evaluate(sub, start, lp.growth, unit, stop=stop)
+    w = _even(sub, start, lp.growth, np.ones(sub.n))
+    if w is None:
+        w = evaluate(sub, start, lp.growth, unit, stop=stop)
     if w is None:
         start = sub.tree[1]
         w = evaluate(sub, start, lp.growth, unit, stop=stop)

@@ -67,6 +67,16 @@ class System:
         _turn(self.begin, self.end, self.indices, self.data, end, indices, data)
         return System(start[:-1], end, indices, data, self.inverse, self.directions.reversed())
 
+    def residual(self, b: Floats, x: Floats) -> Floats:
+        """Return (b + M x - x) / (1 - own), own the diagonal of M."""
+        return self.inverse * (b + self.times(x)) - x
+
+    def times(self, x: Floats) -> Floats:
+        """Return M x without the diagonal of M."""
+        out = np.empty(len(x))
+        _times(self.begin, self.end, self.indices, self.data, x, out)
+        return out
+
     def sweep(
         self, b: Floats, x: Floats, count: int, enough: float = TOLERANCE, flat: float = 0.0
     ) -> tuple[float, float]:
@@ -111,6 +121,15 @@ def _turn(begin, end, indices, data, used, out_indices, out_data):  # type: igno
             out_indices[used[j]] = i
             out_data[used[j]] = data[e]
             used[j] += ONE
+
+
+@kernel
+def _times(begin, end, indices, data, x, out):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(begin))):
+        y = 0.0
+        for e in range(begin[i], end[i]):
+            y += data[e] * x[indices[e]]
+        out[i] = y
 
 
 @kernel
