@@ -61,7 +61,8 @@ def call(
     Ended
         The child ended otherwise.
     """
-    if deadline.left is None and entries < LARGE:
+    small = deadline.left is None and entries < LARGE
+    if small or not sys.executable:  # embedded in another program there is no Python to start
         return function(*arguments)
     code = f"import sys; sys.path[:] = {sys.path!r}; from lmdsl.apart import serve; serve()"
     child = subprocess.Popen(
@@ -69,7 +70,9 @@ def call(
     )
     assert child.stdin is not None
     assert child.stdout is not None
-    watch = None if deadline.left is None else threading.Timer(deadline.left + GRACE, child.kill)
+    seconds, watch = deadline.left, None
+    if seconds is not None:
+        watch = threading.Timer(min(seconds + GRACE, threading.TIMEOUT_MAX), child.kill)
     reply: Any = None
     try:
         if watch is not None:

@@ -13,12 +13,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.lp import StabilizationLP
+if TYPE_CHECKING:
+    from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
 

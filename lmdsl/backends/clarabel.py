@@ -10,13 +10,15 @@ QDLDL more than 3 (not finished) at 100 x 100. V is good to 1e-7 (dual form: 1e-
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
-from lmdsl.lp import StabilizationLP
+
+if TYPE_CHECKING:
+    from lmdsl.lp import StabilizationLP
 
 ALGORITHMS = {
     "primal": "faer",
@@ -51,12 +53,13 @@ SWAPPED = {Stop.INFEASIBLE: Stop.UNBOUNDED, Stop.UNBOUNDED: Stop.INFEASIBLE}
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:
     """Solve with Clarabel."""
+    return ScaledLP.of(lp).solved(_solved, options)
+
+
+def _solved(scaled: ScaledLP, options: Options) -> Solution:
     import clarabel
 
-    scaled = ScaledLP.of(lp)
     algorithm = options.algorithm or next(iter(ALGORITHMS))
-    if scaled.late(options.time_limit):
-        return scaled.too_late()
     dual = algorithm.startswith("dual")
     form = _dual_form(clarabel, scaled) if dual else _primal_form(clarabel, scaled)
     try:
@@ -71,7 +74,7 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     if dual:
         stop = SWAPPED.get(stop, stop)
     x, z = np.array(found.x), np.array(found.z)
-    y, x = (x, z) if dual else (-z[: lp.n], x)
+    y, x = (x, z) if dual else (-z[: len(scaled.b)], x)
     return scaled.solution(stop, word, y, x, found.iterations)
 
 

@@ -11,13 +11,15 @@ limit was reached, and for some solvers calls a limit "optimal_inaccurate"; see 
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.errors import BadInput, shown
-from lmdsl.lp import StabilizationLP
+
+if TYPE_CHECKING:
+    from lmdsl.lp import StabilizationLP
 
 PREFERRED = ("HIGHS", "CLARABEL", "SCIPY")
 """The first of these that is installed is the default."""
@@ -81,11 +83,14 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     BadInput
         CVXPY does not find the solver.
     """
+    return ScaledLP.of(lp).solved(_solved, options)
+
+
+def _solved(scaled: ScaledLP, options: Options) -> Solution:
     with warnings.catch_warnings(), quiet.foreign():
         warnings.simplefilter("ignore")
         import cvxpy
 
-        scaled = ScaledLP.of(lp)
         solver = _solver(cvxpy, options.algorithm)
         if scaled.late(options.time_limit):
             return scaled.too_late()
@@ -94,7 +99,7 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
         if unsupported:
             details["not supported"] = ", ".join(unsupported)
         try:
-            x = cvxpy.Variable(lp.K, nonneg=True)
+            x = cvxpy.Variable(len(scaled.c), nonneg=True)
             balance = scaled.A @ x == scaled.b
             problem = cvxpy.Problem(cvxpy.Minimize(scaled.c @ x), [balance])
             problem.solve(solver=solver, **passed)

@@ -10,7 +10,7 @@ it: crossover 1.7 to 2.3, simplex 9 to 13, PDLP 8 to 12 at 50 x 50 cells; crosso
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.errors import MissingDependency
-from lmdsl.lp import StabilizationLP
+
+if TYPE_CHECKING:
+    from lmdsl.lp import StabilizationLP
 
 ALGORITHMS = {
     "ipx": {"solver": "ipx", "run_crossover": "off"},
@@ -78,11 +80,13 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     MissingDependency
         This installation of highspy lacks the algorithm.
     """
-    with quiet.foreign():
+    return ScaledLP.of(lp).solved(_solved, options)
+
+
+def _solved(scaled: ScaledLP, options: Options) -> Solution:
+    with quiet.foreign():  # some versions greet before they can be told not to
         import highspy
 
-    scaled = ScaledLP.of(lp)
-    with quiet.foreign():  # some versions greet before they can be told not to
         highs = highspy.Highs()
         highs.setOptionValue("output_flag", False)
     _choose(highs, options, scaled.seconds_left(options.time_limit))

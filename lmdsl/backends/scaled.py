@@ -9,17 +9,21 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from traceback import walk_tb
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.backends.base import Solution, Stop
+from lmdsl import apart
+from lmdsl.backends.base import Options, Solution, Stop
+from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.errors import plain_text
-from lmdsl.lp import StabilizationLP
+
+if TYPE_CHECKING:
+    from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
 
@@ -66,6 +70,30 @@ class ScaledLP:
     def too_late(self) -> Solution:
         """Return the solution where building the LP has used up the time: solvers may not look."""
         return Solution(Stop.TIME_LIMIT, "time limit reached before the solver started")
+
+    def solved(self, native: Callable[[ScaledLP, Options], Solution], options: Options) -> Solution:
+        """Ask a solver, in a process of its own where it might not end in time (apart.py).
+
+        Parameters
+        ----------
+        native
+            A function of a module that imports no more than the solver.
+        options
+            As the backend got them.
+        """
+        limit = options.time_limit
+        if self.late(limit):
+            return self.too_late()
+        plain = replace(options, start=None, proof=None, progress=None)
+        deadline = Deadline(self.seconds_left(limit))
+        try:
+            return apart.call(
+                native, self, plain, deadline=deadline, doing="solving", entries=self.A.nnz
+            )
+        except TimeLimitReached:
+            return Solution(Stop.TIME_LIMIT, "ended at the time limit")
+        except apart.Ended as error:
+            return Solution(Stop.FAILED, str(error))
 
     def solution(
         self,
