@@ -19,6 +19,7 @@ from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.scaled import failure
 from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput, MissingDependency, plain_text
+from lmdsl.frozen import freeze
 from lmdsl.lp import StabilizationLP
 
 Pairs = NDArray[np.int64]
@@ -47,7 +48,7 @@ def ask(
     BadInput
         The backend refuses the options, or a package is missing.
     """
-    if backend.capabilities.silent:
+    if backend.capabilities.silent and backends.ours(backend):
         return *_ask(lp, backend, options), ""
     progress = options.progress and quiet.ours(options.progress)
     with quiet.foreign() as printed:
@@ -81,6 +82,7 @@ def _copies(lp: StabilizationLP, options: Options) -> tuple[StabilizationLP, Opt
     """Return copies: what a stranger does to them, then or later, happens to nobody else."""
     own = copy.deepcopy(lp, {id(lp.problem): lp.problem})
     start, proof = copy.copy(options.start), copy.copy(options.proof)
+    freeze(*(array for array in (start, proof) if array is not None))
     return own, replace(options, start=start, proof=proof)
 
 

@@ -28,7 +28,7 @@ IN_PLACE = 4
 """Ranges of a pass in which a cell sees the new values of its own range only: few, to see much."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Improvement:
     """The result of one pass.
 

@@ -15,14 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.axis import EDGE
+from lmdsl.frozen import Frozen
 from lmdsl.kernels import kernel
 from lmdsl.partition import Partition
 
 Ends = dict[str, tuple[float, float]]
 
 
-@dataclass(frozen=True)
-class Region:
+@dataclass(frozen=True, eq=False)
+class Region(Frozen):
     """A box of cells.
 
     Attributes
@@ -52,8 +53,8 @@ MOST_REGIONS = 8
 """Boxes by which a set of cells is named."""
 
 
-@dataclass(frozen=True)
-class Area:
+@dataclass(frozen=True, eq=False)
+class Area(Frozen):
     """A set of cells, by region.
 
     Attributes

@@ -82,7 +82,7 @@ class Certificate:
         return claims and self.gap is not None and self.gap <= self.tolerance
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Witness:
     """The vectors behind a certificate, on C, shape (n,) each.
 
@@ -103,7 +103,7 @@ class Witness:
     mu: Floats | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Verified:
     """A certificate with its witness."""
 

@@ -16,6 +16,7 @@ from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.result import Result
 from lmdsl.stabilize import TOLERANCE, not_compiled, solve
+from lmdsl.surroundings import own_arithmetic
 from lmdsl.transitions import Progress
 
 BACKENDS = ("policy-iteration", "highs", "clarabel", "cvxpy")
@@ -110,6 +111,7 @@ def _row(result: Result) -> tuple[str, ...]:
     )
 
 
+@own_arithmetic
 def compare(
     problem: Problem | StabilizationLP,
     backends: Sequence[Any] = BACKENDS,

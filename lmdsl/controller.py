@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lmdsl.errors import BadInput, shown
+from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus
 from lmdsl.local import LocalController
 from lmdsl.partition import Partition
 from lmdsl.problem import ConstantControl, Problem
 from lmdsl.sampling import noise_nodes
+from lmdsl.surroundings import own_arithmetic
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -21,8 +23,8 @@ Indices = NDArray[np.int64]
 REACHED, LOST, CYCLING = 0, 1, 2
 
 
-@dataclass(frozen=True)
-class Controller:
+@dataclass(frozen=True, eq=False)
+class Controller(Frozen):
     """A feedback law that is constant on each cell.
 
     Attributes
@@ -42,6 +44,7 @@ class Controller:
     index: NDArray[np.int32]
     local: LocalController | None = None
 
+    @own_arithmetic
     def __call__(self, x: ArrayLike) -> Floats:
         """Return the control at states.
 
@@ -105,8 +108,8 @@ class Held:
     distance: tuple[float, float] | None
 
 
-@dataclass(frozen=True)
-class Simulation:
+@dataclass(frozen=True, eq=False)
+class Simulation(Frozen):
     """Outcome of closed-loop runs of the true map from fresh random starts.
 
     Attributes
@@ -260,6 +263,7 @@ class ClosedLoop:
             distance=distance,
         )
 
+    @own_arithmetic
     def path(self, x: ArrayLike, steps: int, seed: int = 0) -> Floats:
         """Return the states of one run, shape (steps taken + 1, d), ending in A or with a loss."""
         rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self, TypeVar
 
 import numpy as np
 from pydantic import (
@@ -18,20 +18,27 @@ from pydantic import (
 
 from lmdsl.errors import BadInput
 from lmdsl.faults import condensed
+from lmdsl.files import strict_json
 from lmdsl.formulas import MAX_CHARACTERS, MAX_NAME, RESERVED, check_name
 
 _K = TypeVar("_K")
 _V = TypeVar("_V")
 
 
+FROZEN = "declared objects are frozen; make a new one with problem.replaced(key=value)"
+
+
 class FrozenDict(dict[_K, _V]):
     """A dict that cannot be changed, so that a declared problem stays what was validated."""
 
     def _refuse(self, *args: Any, **kwargs: Any) -> NoReturn:
-        raise TypeError("declared objects are frozen; make a new one (problem.replaced(...))")
+        raise TypeError(FROZEN)
 
     __setitem__ = __delitem__ = clear = pop = popitem = setdefault = update = _refuse
     __ior__ = _refuse
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(frozenset(self.items()))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (type(self), (dict(self),))
@@ -141,6 +148,39 @@ class Declared(BaseModel, metaclass=_Meta):
     model_config = ConfigDict(
         extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True
     )
+
+    def replaced(self, **changes: Any) -> Self:
+        """Return a copy with some keys changed, validated anew."""
+        return type(self)(
+            **{**{key: getattr(self, key) for key in type(self).model_fields}, **changes}
+        )
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy; what ``update`` changes is validated, as :meth:`replaced` does."""
+        return self.replaced(**update) if update else super().model_copy(deep=deep)
+
+    def copy(self, **options: Any) -> Self:
+        """Refuse: pydantic's old ``copy`` does not check what it changes."""
+        raise BadInput("copy() would not check what it changes; use replaced(key=value)")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Refuse."""
+        raise AttributeError(f"{name} cannot be set: {FROZEN}")
+
+    def __delattr__(self, name: str) -> None:
+        """Refuse."""
+        raise AttributeError(f"{name} cannot be deleted: {FROZEN}")
+
+    @classmethod
+    def model_validate_json(cls, json_data: str | bytes | bytearray, **kwargs: Any) -> Any:
+        """Validate the text of a file, read as strictly as a file is."""
+        content = json_data.encode() if isinstance(json_data, str) else bytes(json_data)
+        return cls.model_validate(strict_json(content), **kwargs)
+
+    @classmethod
+    def model_construct(cls, *args: Any, **values: Any) -> Any:  # type: ignore[override]
+        """Refuse: nothing would be checked."""
+        raise BadInput(f"model_construct() checks nothing; use {cls.__name__}(key=value)")
 
     @classmethod
     def model_validate(cls, obj: Any, **kwargs: Any) -> Any:

@@ -26,7 +26,7 @@ FEW = 4
 """Of so many cells one: these are sorted anew, more are picked from the orders of all."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Directions:
     """The orders of some cells of a box.
 

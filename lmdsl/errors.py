@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 
 class LmdslError(Exception):
     """Base of every error that lmdsl raises on purpose."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle and copy what the error holds, whatever its class takes to be made."""
+        return _revived, (type(self), self.args, vars(self))
+
+
+def _revived(kind: type[LmdslError], args: tuple[Any, ...], state: dict[str, Any]) -> LmdslError:
+    error = kind.__new__(kind)
+    error.args = args
+    vars(error).update(state)
+    return error
 
 
 class BadInput(LmdslError, ValueError):

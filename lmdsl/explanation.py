@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -16,6 +16,7 @@ from lmdsl.boxes import Region
 from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.errors import BadInput, shown
 from lmdsl.facts import NAMES, Why
+from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus
 from lmdsl.hints import Hint, hints
 from lmdsl.lp import StabilizationLP
@@ -23,6 +24,7 @@ from lmdsl.partition import Partition
 from lmdsl.phase_one import PhaseOne
 from lmdsl.problem import Problem
 from lmdsl.sampler import Sampler
+from lmdsl.surroundings import own_arithmetic
 from lmdsl.transitions import Progress, Transitions, assemble
 
 LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
@@ -56,8 +58,8 @@ class Cause:
     elsewhere: int
 
 
-@dataclass(frozen=True, repr=False)
-class Explanation:
+@dataclass(frozen=True, repr=False, eq=False)
+class Explanation(Frozen):
     """Why cells lie outside the stabilizable set C.
 
     Attributes
@@ -82,7 +84,7 @@ class Explanation:
     causes: tuple[Cause, ...]
     hints: tuple[Hint, ...]
     phase_one: PhaseOne | None = None
-    assembled: Transitions | None = None
+    assembled: Transitions | None = field(default=None, compare=False)
 
     @property
     def lost(self) -> int:
@@ -197,6 +199,7 @@ class Explanation:
         return f"Explanation({', '.join(parts) or 'every cell is stabilizable'})"
 
 
+@own_arithmetic
 def explain(
     problem: Problem | StabilizationLP,
     *,

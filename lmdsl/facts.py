@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lmdsl import boxes
 from lmdsl.boxes import Ends, Region
+from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus
 from lmdsl.kernels import kernel
 from lmdsl.partition import Partition
@@ -26,8 +27,8 @@ MOST_BOXES = 8
 Named = dict[str, float]
 
 
-@dataclass(frozen=True)
-class Move:
+@dataclass(frozen=True, eq=False)
+class Move(Frozen):
     """What one control does to a cell that is not stabilizable.
 
     Attributes
@@ -82,8 +83,8 @@ class Move:
         return {name: jsonable(value) for name, value in {**vars(self), "sides": sides}.items()}
 
 
-@dataclass(frozen=True)
-class Why:
+@dataclass(frozen=True, eq=False)
+class Why(Frozen):
     """The cause of one cell and the facts behind it.
 
     Attributes

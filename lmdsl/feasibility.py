@@ -25,7 +25,7 @@ NEAR = 64
 """Largest level up to which a few passes from the levels may make a stabilizing policy."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Feasible:
     """A g-stabilizing policy, and a proof of it: w > 0 with w > g P_u w."""
 
@@ -33,7 +33,7 @@ class Feasible:
     w: Floats
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Refused:
     """A candidate proof that no policy is gamma-stabilizing: w >= 0, w <= gamma P_a w for all a.
 
@@ -45,7 +45,7 @@ class Refused:
     lower: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Undecided:
     """gamma is so close to its limit that doubles decide neither way, or time ran out.
 
@@ -100,7 +100,7 @@ def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused |
     steps, each below the limit of the last policy (unit cost, because under a cost with zeros this
     can stall).
     """
-    reached: Feasible | Refused | Undecided = Undecided(lp.tree[1], 0.0)
+    reached: Feasible | Refused | Undecided = Undecided(lp._algorithm_1[1], 0.0)
     try:
         for reached in _raising(lp, stop):
             if not isinstance(reached, Undecided):
@@ -113,7 +113,7 @@ def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused |
 def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | Undecided]:
     """Raise gamma step by step; yield what is known after each, the decision last."""
     g = lp.growth
-    level, pair = lp.tree
+    level, pair = lp._algorithm_1
     V = level.astype(np.float64)
     for k in range(4 if level.max() <= NEAR else 0):
         better = bellman.rise(lp, V, g, k % 2 == 1)
@@ -177,7 +177,7 @@ def refusal(lp: StabilizationLP, stop: Stop = never) -> Floats | None:
     return None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stopping:
     """The outcome of optimal stopping.
 

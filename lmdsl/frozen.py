@@ -31,10 +31,13 @@ class Frozen:
             return True
         if type(self) is not type(other) or not isinstance(other, Frozen):
             return NotImplemented
-        return all(map(_equal, self._parts(), other._parts()))
+        return all(map(_equal, self._compared(), other._compared()))
 
     def __hash__(self) -> int:
-        return hash((type(self), *map(_key, self._parts())))
+        return hash((type(self), *map(_key, self._compared())))
+
+    def _compared(self) -> list[Any]:
+        return [getattr(self, field.name) for field in fields(self) if field.compare]  # type: ignore[arg-type]
 
     def _parts(self) -> list[Any]:
         return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]

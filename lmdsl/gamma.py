@@ -30,12 +30,14 @@ from numpy.typing import NDArray
 from lmdsl import bounds, feasibility, growth, policy
 from lmdsl.boxes import Area
 from lmdsl.deadline import Deadline
+from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus
 from lmdsl.growth import Growth
 from lmdsl.kernels import kernel
 from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
+from lmdsl.surroundings import own_arithmetic
 from lmdsl.transitions import Progress
 
 Floats = NDArray[np.float64]
@@ -48,8 +50,8 @@ STEPS = (0.1 * WIDTH, 0.4 * WIDTH, 10 * WIDTH, 1e-3, 0.1, 1.0)
 """How far beyond the limit of a policy optimal stopping is asked, until doubles decide."""
 
 
-@dataclass(frozen=True)
-class GammaBar:
+@dataclass(frozen=True, eq=False)
+class GammaBar(Frozen):
     """A proved bracket of gamma_bar.
 
     Attributes
@@ -127,6 +129,7 @@ CORNER = (
 )
 
 
+@own_arithmetic
 def gamma_max(
     problem: Problem | StabilizationLP,
     progress: Progress | None = None,
@@ -171,7 +174,7 @@ def bracket(lp: StabilizationLP, stop: Stop = never, limit: int = 60) -> GammaBa
     certain = exhausted_by_levels(lp)
     if certain is not None:
         return GammaBar(math.inf, math.inf, certain, None, None, stabilizable=lp.n)
-    search = _Search(lp, stop, lp.tree[1])
+    search = _Search(lp, stop, lp._algorithm_1[1])
     with suppress(Stopped):
         search.run(limit)
     return search.found()

@@ -45,7 +45,7 @@ class CellStatus(IntEnum):
     BEYOND_GAMMA = 6
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Predecessors:
     """For every target, the pairs that can reach it: the transpose of the rows' pattern.
 
@@ -71,7 +71,7 @@ class Predecessors:
         return cls(pointer, pair)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Stabilizable:
     """The stabilizable set of a set of transitions.
 

@@ -42,7 +42,7 @@ SMALLEST, LARGEST = 1e-280, 1e300
 """Range of w."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Growth:
     """A policy class by class.
 

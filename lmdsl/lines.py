@@ -35,7 +35,7 @@ LEAST, MOST = 8, 1_000
 ADD, SUBTRACT, MULTIPLY, DIVIDE, NEGATIVE, ABS, SQRT, FLOOR, CEIL = range(len(PLAIN))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Lines:
     """Formulas split into what NumPy evaluates and what is done line by line.
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from lmdsl import riccati
 from lmdsl.declarations import ConstantControl, LinearFeedback, LqrFeedback
 from lmdsl.errors import BadInput
+from lmdsl.frozen import Frozen
 from lmdsl.intervals import Interval
 from lmdsl.jets import Jet
 from lmdsl.partition import Partition
@@ -31,8 +32,8 @@ MAX_RICCATI = 256  # states of the Riccati equation: orbit points times axes
 ON_ORBIT = 1e-3  # cell widths by which a point may miss its successor
 
 
-@dataclass(frozen=True)
-class LocalController:
+@dataclass(frozen=True, eq=False)
+class LocalController(Frozen):
     """u = clip(u_k - K_k (x - x_k)), k the orbit point that owns the cell of x.
 
     Attributes

@@ -30,6 +30,7 @@ from lmdsl.problem import Problem
 from lmdsl.regions import Regions
 from lmdsl.rows import Rows
 from lmdsl.sampling import control_vectors
+from lmdsl.surroundings import own_arithmetic
 from lmdsl.transitions import Progress, assemble
 
 Floats = NDArray[np.float64]
@@ -175,9 +176,16 @@ class StabilizationLP(Frozen):
             cost=self.cost[pair],
         )
 
-    @cached_property
+    @property
     def tree(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""
+        level, pair = self._algorithm_1[0].view(), self._algorithm_1[1].view()
+        freeze(level, pair)
+        return level, pair
+
+    @cached_property
+    def _algorithm_1(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """The same as our own code reads it: compiled loops tell read-only arrays from others."""
         return graph.tree(self.pair_pointer, self.rows)
 
     @property
@@ -253,6 +261,7 @@ class StabilizationLP(Frozen):
         )
 
 
+@own_arithmetic
 def compile(  # noqa: A001
     problem: Problem,
     progress: Progress | None = None,
@@ -305,5 +314,5 @@ def compile(  # noqa: A001
     # The search that found C ends with Algorithm 1 on the surviving pairs.
     pair = found.pair[found.inside]
     column = pair if isinstance(kept, slice) else np.searchsorted(kept, pair)
-    vars(lp)["tree"] = found.level[found.inside], column
+    vars(lp)["_algorithm_1"] = found.level[found.inside], column
     return lp

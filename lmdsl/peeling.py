@@ -34,7 +34,7 @@ FAR = np.uint64(8)
 """Words between the first and last cell of a level, for each cell: with more it is not sorted."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Peeled:
     """A system and its core.
 

@@ -30,6 +30,7 @@ from lmdsl import apart, boxes, linprog, memory
 from lmdsl.deadline import Deadline
 from lmdsl.errors import LmdslError, shown
 from lmdsl.facts import NAMES
+from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus, owner
 from lmdsl.partition import Partition
 from lmdsl.transitions import Transitions
@@ -41,8 +42,8 @@ BYTES = 150
 """Bytes per entry of the LP: SciPy's copies and the factors of HiGHS, roughly."""
 
 
-@dataclass(frozen=True, repr=False)
-class PhaseOne:
+@dataclass(frozen=True, repr=False, eq=False)
+class PhaseOne(Frozen):
     """The solution of the phase-one LP.
 
     Attributes

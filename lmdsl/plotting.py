@@ -29,6 +29,7 @@ from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.regions import Regions
 from lmdsl.sampling import control_values
+from lmdsl.surroundings import own_arithmetic
 
 if TYPE_CHECKING:
     import os
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 FORMATS = ("png", "pdf", "svg")
 
 
+@own_arithmetic
 def portrait(
     problem: Problem | Result,
     control: ArrayLike | Mapping[str, float] | None = None,
@@ -112,6 +114,7 @@ def portrait(
     return drawn
 
 
+@own_arithmetic
 def cost(
     result: Result,
     ax: Axes | None = None,
@@ -151,6 +154,7 @@ def cost(
     return drawn
 
 
+@own_arithmetic
 def causes(
     explanation: Explanation,
     ax: Axes | None = None,
@@ -186,6 +190,7 @@ def causes(
     return drawn
 
 
+@own_arithmetic
 def control(
     result: Result,
     name: str | None = None,
@@ -241,6 +246,7 @@ def control(
     return drawn
 
 
+@own_arithmetic
 def measure(
     result: Result,
     ax: Axes | None = None,
@@ -277,6 +283,7 @@ def measure(
     return drawn
 
 
+@own_arithmetic
 def trajectories(
     result: Result,
     ax: Axes | None = None,
@@ -342,6 +349,7 @@ def trajectories(
     return drawn
 
 
+@own_arithmetic
 def figure(
     result: Result,
     path: str | os.PathLike[str] | None = None,

@@ -117,7 +117,7 @@ def _reach(pair, pointer, target, reaches, sweeps):  # type: ignore[no-untyped-d
     return False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Iteration:
     """The outcome of policy iteration.
 
@@ -326,12 +326,12 @@ def canonical(
     start = np.minimum(start, len(columns) - 1)
     owned = columns[start] == pair[inside]
     if not owned.all():
-        start = np.where(owned, start, sub.tree[1])
+        start = np.where(owned, start, sub._algorithm_1[1])
     w = _even(sub, start, lp.growth, np.ones(sub.n))
     if w is None:
         w = evaluate(sub, start, lp.growth, unit, stop=stop)
     if w is None:
-        start = sub.tree[1]
+        start = sub._algorithm_1[1]
         w = evaluate(sub, start, lp.growth, unit, stop=stop)
     if w is None:
         return pair

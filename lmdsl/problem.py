@@ -271,9 +271,15 @@ class Problem(Declared):
                     f"[{a!r}, {b!r}] is empty; write [a, b] with a < b", f"{where}.{name}"
                 )
 
-    def replaced(self, **changes: Any) -> Problem:
-        """Return a copy with some keys changed, validated anew."""
-        return Problem(**{**{key: getattr(self, key) for key in Problem.model_fields}, **changes})
+    def __eq__(self, other: object) -> bool:
+        """Compare all keys, and the order of axes and controls: it numbers cells and vectors."""
+        if not isinstance(other, Problem):
+            return NotImplemented
+        order = (self.states, self.controls) == (other.states, other.controls)
+        return order and super().__eq__(other)
+
+    def __hash__(self) -> int:
+        return super().__hash__()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the problem as plain data that ``json.dumps`` accepts, defaults written out."""

@@ -14,7 +14,7 @@ from lmdsl.problem import Problem
 from lmdsl.program import Program
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Regions:
     """Which cells are attractor (A), avoid (Z) or free (neither).
 

@@ -15,12 +15,14 @@ from lmdsl.boxes import Area
 from lmdsl.certificate import Certificate
 from lmdsl.controller import ClosedLoop, Controller, Simulation, simulate
 from lmdsl.errors import BadInput, shown
+from lmdsl.frozen import Frozen, freeze
 from lmdsl.graph import CellStatus
 from lmdsl.local import LocalController
 from lmdsl.local_check import LocalCheck
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.regions import Regions
+from lmdsl.surroundings import own_arithmetic
 from lmdsl.systems.base import NotStored
 
 if TYPE_CHECKING:
@@ -42,8 +44,8 @@ class Seconds:
     verify: float | None = None
 
 
-@dataclass(frozen=True, kw_only=True)
-class Report:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Report(Frozen):
     """The scalar part of a result: the keys of ``lmdsl solve --json``, in order.
 
     Attributes
@@ -146,7 +148,7 @@ class CostFrom:
     mass: float
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class Result(Report):
     """The answer to a problem; see :class:`Report` for the scalars.
 
@@ -234,8 +236,10 @@ class Result(Report):
         weight = np.zeros(self.partition.size)
         on = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
         weight[on] = Regions.of(self.problem, self.partition).weight(on)
+        freeze(weight)
         return weight
 
+    @own_arithmetic
     def cost_from(self, *boxes: Mapping[str, tuple[float, float]]) -> CostFrom:
         """Return the conditional cost of starting in a region: sum over B of m V / m(B).
 
@@ -269,6 +273,7 @@ class Result(Report):
             upper, lower = (math.fsum(weight[on] * x[on]) / mass for x in (self.value, self.lower))
         return CostFrom(upper * (1 + 1e-15), lower * (1 - 1e-15), mass)
 
+    @own_arithmetic
     def simulate(
         self, starts: int = 10_000, steps: int = 10_000, seed: int = 0, hold: int = 1_000
     ) -> Simulation:
@@ -297,6 +302,7 @@ class Result(Report):
         weight = self.weight[cells]
         return simulate(self.closed_loop, cells, weight, starts, steps, seed, hold)
 
+    @own_arithmetic
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the result as a directory that appears whole or not at all."""
         from lmdsl.archive import save

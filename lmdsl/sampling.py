@@ -69,7 +69,7 @@ def control_count(problem: Problem) -> int:
     )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Nodes:
     """The noise nodes of a problem.
 

@@ -31,7 +31,7 @@ LEAST_SCALE = 1e-30
 MOST = 1e308
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pass:
     """The outcome of one pass.
 

@@ -24,6 +24,7 @@ from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.result import Result, Seconds
 from lmdsl.sampling import control_count, control_vectors
+from lmdsl.surroundings import own_arithmetic
 from lmdsl.transitions import Progress
 from lmdsl.witness import certify
 
@@ -34,6 +35,7 @@ UNKNOWN = 255
 Pairs = NDArray[np.int64]
 
 
+@own_arithmetic
 def solve(
     problem: Problem | StabilizationLP,
     backend: str | Backend = backends.DEFAULT,
@@ -221,7 +223,7 @@ def _refuse(lp: StabilizationLP, found: feasibility.Refused, tolerance: float) -
     return Verified(certificate.check(lp, witness, tolerance), witness)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Outcome:
     """A policy after polishing, and what polishing did."""
 

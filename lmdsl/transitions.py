@@ -33,7 +33,7 @@ Floats = NDArray[np.float64]
 Progress = Callable[[str, float], None]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Transitions:
     """The admissible pairs of a problem, ordered by cell, then control.
 

@@ -29,6 +29,7 @@ from lmdsl.regions import Regions
 from lmdsl.result import Result, jsonable
 from lmdsl.rows import Rows, Shares
 from lmdsl.sampling import noise_nodes, sample_points
+from lmdsl.surroundings import own_arithmetic
 from lmdsl.systems import FunctionSystem
 from lmdsl.transitions import Progress, estimate
 
@@ -81,6 +82,7 @@ class Verification:
         }
 
 
+@own_arithmetic
 def verify(
     path: str | os.PathLike[str], exact: bool = False, progress: Progress | None = None
 ) -> Verification:

@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.frozen import Frozen
+
 if TYPE_CHECKING:
     from lmdsl.lp import StabilizationLP
 
@@ -47,8 +49,8 @@ class Stop(Enum):
         return self in (Stop.OPTIMAL, Stop.INACCURATE)
 
 
-@dataclass(frozen=True)
-class Capabilities:
+@dataclass(frozen=True, eq=False)
+class Capabilities(Frozen):
     """What a backend can do.
 
     Attributes
@@ -83,7 +85,7 @@ class Capabilities:
     extras: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Options:
     """What the user asks of a backend.
 
@@ -114,7 +116,7 @@ class Options:
     progress: Callable[[str, float], None] | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Solution:
     """What a backend returns; every part but ``stop`` and ``word`` may be missing.
 

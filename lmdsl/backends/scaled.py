@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ScaledLP:
     """The scaled LP; its arrays are copies, so that no solver can touch the model's.
 

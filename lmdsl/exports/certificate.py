@@ -20,11 +20,13 @@ from lmdsl.gamma import restricted
 from lmdsl.graph import CellStatus
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.result import Result
+from lmdsl.surroundings import own_arithmetic
 
 FORMAT = "lmdsl-certificate/1"
 VECTORS = {"V_up": "value", "W": "lower", "w": "witness", "mu": "measure"}
 
 
+@own_arithmetic
 def export_certificate(
     result: Result, path: str | os.PathLike[str], lp: StabilizationLP | None = None
 ) -> None:

@@ -14,8 +14,10 @@ from pathlib import Path
 from lmdsl.errors import BadInput
 from lmdsl.files import write_whole
 from lmdsl.lp import StabilizationLP
+from lmdsl.surroundings import own_arithmetic
 
 
+@own_arithmetic
 def export_drn(lp: StabilizationLP, path: str | os.PathLike[str]) -> None:
     """Write the finite model as a Markov decision process for Storm; only for gamma = 1.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 PASSED, FAILED, SKIPPED = "passed", "failed", "skipped"
 
@@ -84,3 +85,6 @@ class ContractFailure(AssertionError):
         self.report = report
         lines = [f"the backend {report.backend} breaks the contract", *map(str, report.failed)]
         super().__init__("\n".join(lines))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.report,)
