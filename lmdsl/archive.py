@@ -167,7 +167,7 @@ def _certificate(result: Result) -> dict[str, Any]:
     proof = result.certificate
     return {
         "format": FORMAT,
-        **result.to_dict(),
+        **result.stored(),
         "cause": result.cause,
         "claims": {name: getattr(proof, name) for name in (*CLAIMS, "refusal")},
         "measure_residual": jsonable(proof.measure_residual),

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput, shown
 from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus
@@ -21,6 +22,9 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 REACHED, LOST, CYCLING = 0, 1, 2
+FOREVER = Deadline()
+FEW = 0.01
+"""Share of the runs that may miss the attractor before the samples are called too few."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +129,10 @@ class Simulation(Frozen):
         95 % Clopper-Pearson interval of the share reached.
     held
         What became of the reached under the local controller; None without one.
+    steps_made
+        Steps that were made: fewer than the limit where every run ended, or the time was up.
+    cut
+        The time was up: the runs that had not ended count as cycling.
     """
 
     starts: int
@@ -134,6 +142,8 @@ class Simulation(Frozen):
     steps: dict[str, int] | None
     interval: tuple[float, float]
     held: Held | None = None
+    steps_made: int = 0
+    cut: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
@@ -141,6 +151,19 @@ class Simulation(Frozen):
         if self.held is not None and self.held.distance is not None:
             data["held"]["distance"] = list(self.held.distance)
         return data
+
+    def sentence(self) -> str:
+        """Return what became of the runs, and what it means where many did not arrive."""
+        parts = [f"true map: {self.reached:,} of {self.starts:,} runs arrive"]
+        parts += [f"{self.lost:,} {'is' if self.lost == 1 else 'are'} lost"] * bool(self.lost)
+        parts += [f"{self.cycling:,} cycle{'s'[self.cycling != 1 :]}"] * bool(self.cycling)
+        text = ", ".join(parts)
+        if self.cut:
+            text += f" or are cut off after {self.steps_made:,} steps"
+        usual = self.steps["q50"] if self.steps else self.steps_made
+        underway = self.cut and self.steps_made < 10 * usual
+        missed = self.lost + self.cycling * (not underway)
+        return text + ": too few samples, or too large cells" * (missed > FEW * self.starts)
 
     def text(self) -> str:
         """Return a summary for people."""
@@ -200,9 +223,9 @@ class ClosedLoop:
         return states, self.partition.locate(list(states.T))
 
     def run(
-        self, x: Floats, steps: int, rng: np.random.Generator
+        self, x: Floats, steps: int, rng: np.random.Generator, late: Deadline = FOREVER
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
-        """Run from states until A, loss, or the step limit.
+        """Run from states until A, loss, the step limit, or the deadline.
 
         Returns
         -------
@@ -228,19 +251,25 @@ class ClosedLoop:
                     arrived.append(x[ended])
             on = state == CellStatus.STABILIZED
             active, x, cell = active[on], x[on], cell[on]
-            if n == steps or not len(active):
+            if n == steps or not len(active) or late():
+                taken[active] = n
                 break
             x, cell = self.step(x, cell, rng)
         return outcome, taken, np.concatenate(arrived)
 
-    def hold(self, x: Floats, steps: int, rng: np.random.Generator) -> Held:
+    def hold(
+        self, x: Floats, steps: int, rng: np.random.Generator, late: Deadline = FOREVER
+    ) -> Held:
         """Run on from states of A, under the local controller inside A and the other outside."""
         local = self.controller.local
         if local is None:
             raise BadInput("the problem names no local controller", "local_controller")
         (x, cell), runs = self.enter(x), len(x)
         stayed = np.ones(runs, dtype=np.bool_)
-        for _ in range(steps):
+        for n in range(steps):
+            if late():
+                steps = n
+                break
             x, cell = self.step(x, cell, rng)
             state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
             on = state <= CellStatus.STABILIZED
@@ -292,6 +321,7 @@ def simulate(
     steps: int,
     seed: int,
     hold: int,
+    late: Deadline,
 ) -> Simulation:
     """Simulate closed-loop runs from random starts.
 
@@ -305,13 +335,17 @@ def simulate(
         Number of runs, step limit, seed of starts and noise.
     hold
         Steps to run on after the first entry into A, where there is a local controller.
+    late
+        When to stop: the runs that have not ended by then count as cycling.
     """
     rng = np.random.default_rng(seed)
     if not len(cells) or not weight.any():
         raise BadInput("there is no stabilizable cell to start from")
     x = draw_starts(loop.partition, cells, weight, starts, rng)
-    outcome, taken, arrived = loop.run(x, steps, rng)
+    outcome, taken, arrived = loop.run(x, steps, rng, late)
     reached = int((outcome == REACHED).sum())
+    made = int(taken.max())
+    cycling = int((outcome == CYCLING).sum())
     quantiles = None
     if reached:
         q = np.quantile(taken[outcome == REACHED], [0, 0.5, 0.9, 0.99, 1], method="inverted_cdf")
@@ -320,10 +354,12 @@ def simulate(
         starts=starts,
         reached=reached,
         lost=int((outcome == LOST).sum()),
-        cycling=int((outcome == CYCLING).sum()),
+        cycling=cycling,
         steps=quantiles,
         interval=clopper_pearson(reached, starts),
-        held=loop.hold(arrived, hold, rng) if loop.controller.local is not None else None,
+        held=None if loop.controller.local is None else loop.hold(arrived, hold, rng, late),
+        steps_made=made,
+        cut=bool(cycling) and made < steps,
     )
 
 

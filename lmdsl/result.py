@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lmdsl.boxes import Area
 from lmdsl.certificate import Certificate
 from lmdsl.controller import ClosedLoop, Controller, Simulation, simulate
+from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput, shown
 from lmdsl.frozen import Frozen, freeze
 from lmdsl.graph import CellStatus
@@ -42,6 +43,37 @@ class Seconds:
     compile: float | None = None
     solve: float | None = None
     verify: float | None = None
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of the box the controller serves; cells are equal shares of its volume.
+
+    Attributes
+    ----------
+    stabilizable, free
+        Number of cells of C, and of cells outside A and Z.
+    share
+        The one of the other; None where no cell is free.
+    """
+
+    stabilizable: int
+    free: int
+    share: float | None
+
+    @classmethod
+    def of(cls, cell_status: NDArray[np.uint8]) -> Coverage:
+        """Count the cells."""
+        free = int((~np.isin(cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID))).sum())
+        stabilizable = int((cell_status == CellStatus.STABILIZED).sum())
+        return cls(stabilizable, free, stabilizable / free if free else None)
+
+    def __str__(self) -> str:
+        text = f"{self.stabilizable} of {self.free} free cells stabilizable"
+        if self.share is None:
+            return text
+        percent = 100 * self.share if self.share == 1 else min(100 * self.share, 99.99)
+        return f"{text} ({percent:.4g} %)"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -74,6 +106,8 @@ class Report(Frozen):
         One sentence for people.
     local_controller
         Whether the problem's local controller keeps the attractor cells; None without one.
+    simulation
+        Runs of the true map that ``lmdsl solve`` made; None where none was asked for.
     """
 
     status: str
@@ -95,12 +129,30 @@ class Report(Frozen):
     seconds: Seconds = field(default_factory=Seconds)
     message: str = ""
     local_controller: LocalCheck | None = None
+    simulation: Simulation | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
-        data = {f.name: jsonable(getattr(self, f.name)) for f in fields(Report)}
+        covered, runs = self.coverage, self.simulation
+        return {
+            **self.stored(),
+            "coverage": covered and asdict(covered),
+            "simulation": runs and jsonable(runs.to_dict()),
+        }
+
+    def stored(self) -> dict[str, Any]:
+        """Return the part of the data that certificate.json keeps."""
+        names = [f.name for f in fields(Report) if f.name != "simulation"]
         cells = self.beyond_gamma
-        return {**data, "beyond_gamma": cells and cells.to_dict()}
+        return {
+            **{name: jsonable(getattr(self, name)) for name in names},
+            "beyond_gamma": cells and cells.to_dict(),
+        }
+
+    @property
+    def coverage(self) -> Coverage | None:
+        """How much of what is neither attractor nor avoided is stabilizable; None if unknown."""
+        return None
 
     @property
     def beyond_gamma(self) -> Area | None:
@@ -207,6 +259,11 @@ class Result(Report):
         """True when the certificate is complete and the gap within the tolerance."""
         return self.certificate.verified
 
+    @property
+    def coverage(self) -> Coverage | None:
+        """How much of what is neither attractor nor avoided is stabilizable; None if unknown."""
+        return None if self.attractor_cells is None else Coverage.of(self.cell_status)
+
     @cached_property
     def controller(self) -> Controller:
         """The feedback law, ``u = result.controller(x)``: the paper's C1, and C0 in A if any."""
@@ -275,7 +332,12 @@ class Result(Report):
 
     @own_arithmetic
     def simulate(
-        self, starts: int = 10_000, steps: int = 10_000, seed: int = 0, hold: int = 1_000
+        self,
+        starts: int = 10_000,
+        steps: int = 10_000,
+        seed: int = 0,
+        hold: int = 1_000,
+        time_limit: float | None = None,
     ) -> Simulation:
         """Run the true map under the controller from fresh random starts drawn by m.
 
@@ -285,11 +347,13 @@ class Result(Report):
             Number of runs, step limit of each, seed of starts and noise.
         hold
             With a local controller, steps to run on after the first entry into A.
+        time_limit
+            Seconds; runs that have not ended by then count as cycling.
 
         Raises
         ------
         BadInput
-            There is no controller, or a count is not positive.
+            There is no controller, or a count or the limit is not positive.
         """
         for name, count in (("starts", starts), ("steps", steps), ("hold", hold)):
             if not isinstance(count, int | np.integer) or count < 1:
@@ -300,7 +364,8 @@ class Result(Report):
             raise BadInput("there is no controller to simulate: " + self.message)
         cells = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
         weight = self.weight[cells]
-        return simulate(self.closed_loop, cells, weight, starts, steps, seed, hold)
+        late = Deadline.of(time_limit)
+        return simulate(self.closed_loop, cells, weight, starts, steps, seed, hold, late)
 
     @own_arithmetic
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -322,5 +387,5 @@ class Result(Report):
             parts.append(f"cost={self.cost:.9g}")
         if self.gap is not None:
             parts.append(f"gap={self.gap:.2g}")
-        parts.append(f"{self.stabilizable_cells} of {self.cells} cells stabilized")
+        parts.append(str(self.coverage or f"{self.cells} cells"))
         return f"Result({', '.join(parts)})"

@@ -22,7 +22,7 @@ from lmdsl.local_check import check
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.result import Result, Seconds
+from lmdsl.result import Coverage, Result, Seconds
 from lmdsl.sampling import control_count, control_vectors
 from lmdsl.surroundings import own_arithmetic
 from lmdsl.transitions import Progress
@@ -355,9 +355,10 @@ class _Job:
         proof = verified.certificate
         if proof.verified:
             status = "verified"
+            free = Coverage.of(self.lp.cell_status).free
             message = (
-                f"the controller brings every one of {self.lp.n} cells to the attractor; "
-                f"its cost is within {proof.gap:.2g} of optimal (finite model)"
+                f"the controller brings every one of {self.lp.n} cells (of {free} free) to the "
+                f"attractor; its cost is within {proof.gap:.2g} of optimal (finite model)"
             )
         else:
             failed = not solution.stop.success and not undecided

@@ -18,7 +18,7 @@ KEYS = [
     "status", "backend", "solver_status", "gamma", "cost", "lower_bound", "gap", "tolerance",
     "contraction", "gamma_bar", "cells", "controls", "pairs", "attractor_cells",
     "stabilizable_cells", "polish_steps", "seconds", "message",
-    "local_controller", "beyond_gamma",
+    "local_controller", "beyond_gamma", "coverage", "simulation",
 ]  # fmt: skip
 
 
@@ -62,7 +62,11 @@ def test_solve_and_everything_after(capsys, file, tmp_path):
         "solution.npz",
     ]
     stored = json.loads((out / "certificate.json").read_text())
-    assert {key: stored[key] for key in KEYS} == report
+    assert report.pop("coverage") == {"stabilizable": 392, "free": 392, "share": 1}
+    runs = report.pop("simulation")
+    assert (runs["starts"], runs["reached"]) == (1000, 1000)
+    assert {"coverage", "simulation"} & stored.keys() == set()
+    assert {key: stored[key] for key in KEYS[:-2]} == report
     assert len(stored["model_sha256"]) == 64
     with np.load(out / "solution.npz", allow_pickle=False) as arrays:
         assert arrays["control_index"].dtype == np.int32

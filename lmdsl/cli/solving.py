@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import sys
+from dataclasses import replace
 from typing import Any
 
 from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
 from lmdsl.cli.streams import say, tell
-from lmdsl.errors import printable
+from lmdsl.errors import plain_text, printable
+
+STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
+"""Runs of the true map that follow a solve: how many, how long, and how long all together."""
 
 
 def add(command: Command) -> None:
@@ -22,6 +27,8 @@ def add(command: Command) -> None:
     solve.add_argument("--restrict-to-gamma", action="store_true",
                        help="solve on the cells for which gamma is feasible")  # fmt: skip
     solve.add_argument("--out", metavar="DIR", help="write controller and certificate to DIR")
+    solve.add_argument("--no-simulate", dest="simulate", action="store_false",
+                       help="make no runs of the true map")  # fmt: skip
     as_json(solve)
 
     compare = command("compare", _compare, "Solve with several backends and compare.")
@@ -69,15 +76,36 @@ def _solve(parsed: Arguments) -> int:
         )
     saved = parsed.out is not None and result.lp is not None  # else there was no time to compile
     tell(result.log)
+    if not parsed.json:
+        say(_summary(result))
     if saved:
         result.save(parsed.out)
-    if parsed.json:
-        print_json(result.to_dict())
-    else:
-        say(_summary(result))
-        if saved:
+        if not parsed.json:
             say(f"written to {printable(parsed.out)}")
-    return result.exit_status
+    try:  # what is known by now is known whatever becomes of the simulation
+        if parsed.simulate:
+            result = _simulated(result)
+    finally:
+        if parsed.json:
+            print_json(result.to_dict())
+    if result.simulation and not parsed.json:
+        word = "verified" if result.verified else "not verified"
+        say(f"{word} on the finite model; {result.simulation.sentence()}")
+    return int(result.exit_status)
+
+
+def _simulated(result: Any) -> Any:
+    """Return a result with runs of the true map, where there is a controller."""
+    if (result.control_index < 0).all():
+        return result
+    try:
+        with Progress() as progress:
+            progress("simulate", -1.0)
+            runs = result.simulate(STARTS, STEPS, time_limit=SECONDS)
+    except Exception as error:
+        print(f"lmdsl: not simulated: {plain_text(error)}", file=sys.stderr)
+        return result
+    return replace(result, simulation=runs)
 
 
 def _compare(parsed: Arguments) -> int:
@@ -113,11 +141,12 @@ def _summary(result: Any) -> str:
         ("backend", printable(f"{result.backend} ({result.solver_status or '-'})")),
         ("cells", f"{result.cells} = {result.attractor_cells} attractor + "
                   f"{result.stabilizable_cells} stabilizable + {_others(result)}"),
+        ("coverage", str(result.coverage)),
         ("pairs", f"{result.pairs} surviving, {result.controls} controls"),
         ("gamma", f"{result.gamma!r}"),
     ]  # fmt: skip
     if result.lp is None:  # there was no time to compile
-        rows[3:5] = [("cells", str(result.cells)), ("controls", str(result.controls))]
+        rows[3:6] = [("cells", str(result.cells)), ("controls", str(result.controls))]
     elif result.status != "not_stabilizable":
         rows += [
             ("cost", f"{number(result.cost)} (lower bound {number(result.lower_bound)})"),
