@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from lmdsl import forking as forking
+
 if TYPE_CHECKING:
     from lmdsl import backends as backends
     from lmdsl import exports as exports
@@ -66,9 +68,11 @@ __all__ = ["__version__", *_HOME, *_MODULES]
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
-        value = getattr(import_module(f"lmdsl.{_HOME[name]}"), name)
+        with forking.whole:
+            value = getattr(import_module(f"lmdsl.{_HOME[name]}"), name)
     elif name in _MODULES:
-        value = import_module(f"lmdsl.{name}")
+        with forking.whole:
+            value = import_module(f"lmdsl.{name}")
     else:
         raise AttributeError(f"module 'lmdsl' has no attribute {name!r}")
     globals()[name] = value

@@ -10,11 +10,12 @@ Comp. 74, 2005). From one sweep to the next a single axis turns, the first axis 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from lmdsl.forking import cached_property
 
 MOST_FLIPPED = 2
 """Axes besides the first that are visited in both directions: the last ones of many.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from lmdsl.boxes import Region
 from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.errors import BadInput, shown
 from lmdsl.facts import NAMES, Why
+from lmdsl.forking import cached_property
 from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus
 from lmdsl.hints import Hint, hints

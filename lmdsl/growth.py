@@ -10,7 +10,6 @@ grow over hundreds of decades, costs one pass.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from lmdsl import bounds, linear
 from lmdsl.directions import Directions
+from lmdsl.forking import cached_property
 from lmdsl.kernels import kernel
 from lmdsl.linear import Stop, never
 from lmdsl.lp import StabilizationLP

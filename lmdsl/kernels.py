@@ -18,7 +18,7 @@ import sys
 import uuid
 import warnings
 from collections.abc import Iterator
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, TypeVar
@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.errors import BadInput, shown
+from lmdsl.forking import cached_property, hold
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -44,6 +45,7 @@ def _started() -> tuple[Any, str]:
         warnings.simplefilter("always")
         try:
             import numba
+            import numba.core.compiler_lock
             import numba.core.serialize
             import numba.misc.appdirs
         except (ValueError, RuntimeError) as error:  # such as no threads
@@ -65,6 +67,8 @@ def _started() -> tuple[Any, str]:
 
 
 numba, _unusable = _started()
+if numba:
+    hold(numba.core.compiler_lock.global_compiler_lock)
 threads = numba.config.NUMBA_NUM_THREADS if numba else 1
 """The most threads that may be used: ``NUMBA_NUM_THREADS``."""
 

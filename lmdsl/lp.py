@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import os
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from lmdsl.deadline import Deadline
 from lmdsl.directions import Directions
 from lmdsl.errors import BadInput
 from lmdsl.files import write_whole
+from lmdsl.forking import cached_property
 from lmdsl.frozen import Frozen, freeze
 from lmdsl.graph import CellStatus, Predecessors
 from lmdsl.local import LocalController

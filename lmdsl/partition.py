@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.axis import EDGE, Axis
 from lmdsl.errors import BadInput
+from lmdsl.forking import cached_property
 from lmdsl.frozen import Frozen
 from lmdsl.problem import Problem
 

@@ -13,12 +13,12 @@ flows down to the core, which is solved last.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import threads
+from lmdsl.forking import cached_property
 from lmdsl.kernels import kernel
 from lmdsl.sweeps import CEILING, NEVER, ONE, System
 

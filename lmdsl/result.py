@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from lmdsl.certificate import Certificate
 from lmdsl.controller import ClosedLoop, Controller, Simulation, simulate
 from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput, shown
+from lmdsl.forking import cached_property
 from lmdsl.frozen import Frozen, freeze
 from lmdsl.graph import CellStatus
 from lmdsl.local import LocalController

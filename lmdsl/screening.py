@@ -13,12 +13,12 @@ all rows of a cell in less time than it takes to find out which of them to read.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import bellman
+from lmdsl.forking import cached_property
 from lmdsl.kernels import kernel
 from lmdsl.lp import StabilizationLP
 from lmdsl.rows import Slots, copy_row

@@ -16,7 +16,7 @@ PACKAGE = Path(lm.__file__).parent
 
 # Data flows one way: a module imports only from modules on an earlier line.
 ORDER = """
-errors frozen surroundings
+errors frozen forking surroundings
 kernels
 files staging quiet
 formulas

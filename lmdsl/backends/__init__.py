@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.errors import BadInput, MissingDependency, plain_text, shown
+from lmdsl.forking import whole
 
 BUILT_IN = {
     "policy-iteration": "lmdsl.backends.policy_iteration",
@@ -145,7 +146,8 @@ def resolve(spec: str | Backend) -> tuple[Backend, str | None]:
 
 
 def _record(name: str) -> Backend:
-    found: Backend = import_module(BUILT_IN[name]).BACKEND
+    with whole:
+        found: Backend = import_module(BUILT_IN[name]).BACKEND
     return found
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
+from lmdsl.forking import forked
 
 if TYPE_CHECKING:
     from lmdsl.lp import StabilizationLP
@@ -99,6 +100,11 @@ def _settings(clarabel: Any, options: Options, factorisation: str) -> Any:
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.direct_solve_method = factorisation
+    if forked():  # faer would wait for threads that are gone
+        if hasattr(settings, "max_threads"):
+            settings.max_threads = 1
+        else:
+            settings.direct_solve_method = "qdldl"
     wanted = TOLERANCE if options.tolerance is None else min(TOLERANCE, options.tolerance / 10)
     for name in TOLERANCES:
         setattr(settings, name, max(wanted, LEAST_TOLERANCE))

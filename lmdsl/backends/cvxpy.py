@@ -17,6 +17,7 @@ from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.errors import BadInput, shown
+from lmdsl.forking import forked
 
 if TYPE_CHECKING:
     from lmdsl.lp import StabilizationLP
@@ -133,6 +134,8 @@ def _passed(
     """Return the keywords of ``Problem.solve``, and the options that the solver does not get."""
     passed: dict[str, Any] = dict(FIXED.get(solver, {}))
     unsupported = []
+    if solver == "CLARABEL" and forked():
+        passed["direct_solve_method"] = "qdldl"  # its default may wait for threads that are gone
     if seconds is not None:
         if solver in TIME_LIMIT:
             passed[TIME_LIMIT[solver]] = max(seconds, 1e-9)  # to some solvers 0 is no limit

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property, partial
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from lmdsl.declared import Declared, Formulas, Parameters, Positive, plain
 from lmdsl.errors import BadInput, shown
+from lmdsl.forking import cached_property
 from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, Formula, parse
 from lmdsl.jets import Jet
 from lmdsl.program import Check, Program

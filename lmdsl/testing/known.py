@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.forking import cached_property
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 
