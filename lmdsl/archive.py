@@ -1,30 +1,29 @@
-"""Result directories: written whole or not at all, and read with suspicion.
+"""Results as directories: what each file says, written and read.
 
 A directory holds problem.json, certificate.json and solution.npz; for a system written in Python
 also model.npz, the compiled rows. Arrays are accepted only with the shape and type the problem
-implies, judged from the archive's directory and headers before anything is allocated; pickles are
-never loaded.
+implies.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
-import json
 import os
 import sys
-import zipfile
+import tempfile
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import memory, staging
+from lmdsl import arrays, folder, memory, saving
 from lmdsl.certificate import CLAIMS, Certificate
 from lmdsl.errors import BadInput, shown
-from lmdsl.files import read_json
+from lmdsl.files import MAX_FILE_BYTES, parsed, reason
+from lmdsl.folder import FORMAT, Reading
 from lmdsl.local_check import LocalCheck
 from lmdsl.lp import StabilizationLP
 from lmdsl.partition import Partition
@@ -34,8 +33,6 @@ from lmdsl.sampling import control_count, control_vectors
 from lmdsl.systems import FunctionSystem
 from lmdsl.systems.base import NotStored
 
-FORMAT = "lmdsl-result/1"
-FILES = ("problem.json", "certificate.json", "solution.npz", "model.npz", "figures.png")
 TYPES = {
     "control_index": "<i4",
     "value": "<f8",
@@ -44,48 +41,6 @@ TYPES = {
     "cell_status": "|u1",
     "witness": "<f8",
 }
-MODEL = ("pair_pointer", "control", "pointer", "target", "code", "cost")
-
-
-def refuse_unless_free(path: str | os.PathLike[str]) -> None:
-    """Refuse a path that cannot become a result directory, before work starts.
-
-    Raises
-    ------
-    BadInput
-        The path is a file, its parent is missing or cannot be written, or it is a folder that
-        holds anything lmdsl did not write.
-    """
-    target = Path(path)
-    text = shown(str(target), 200)
-    try:
-        if target.is_symlink() or (target.exists() and not target.is_dir()):
-            raise BadInput(f"{text} exists and is no directory; choose another name", "out")
-        if target.is_dir():
-            held = {entry.name for entry in target.iterdir()}
-            if held and ("certificate.json" not in held or held - set(FILES)):
-                raise BadInput(
-                    f"{text} is not empty and not a result directory; choose another name", "out"
-                )
-        parent = _existing_parent(target)
-        if not os.access(parent, os.W_OK | os.X_OK):
-            raise BadInput(
-                f"cannot write in {shown(str(parent), 200)}; choose another place", "out"
-            )
-    except (OSError, ValueError) as error:
-        if isinstance(error, BadInput):
-            raise
-        reason = (getattr(error, "strerror", None) or str(error)).lower()
-        raise BadInput(f"cannot use {text}: {reason}", "out") from None
-
-
-def _existing_parent(target: Path) -> Path:
-    parent = target.absolute().parent
-    while not parent.exists():
-        parent = parent.parent
-    if not parent.is_dir():
-        raise BadInput(f"{shown(str(parent), 200)} is not a directory", "out")
-    return parent
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> None:
@@ -94,73 +49,52 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     BadInput
-        The place cannot be used.
+        The place cannot be used, or the result does not hold what a directory needs.
     """
     if result.lp is None and not result.model_sha256:
         raise BadInput("there is no model to save: " + result.message, "out")
-    refuse_unless_free(path)
-    target = Path(path).absolute()
+    saving.refuse_unless_free(path)
+    contents = _contents(result)
+    about = _certificate(result)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        staging.clear(target, FILES)
-        with staging.beside(target) as work:
-            _replace(result, target, work)
+        saving.write(saving.place(path), contents, lambda keys: folder.text({**about, **keys}))
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise BadInput(f"cannot write {shown(str(path), 200)}: {reason}", "out") from None
+        text = shown(str(path), 200)
+        raise BadInput(f"cannot write {text}: {reason(error)}", "out") from None
 
 
-def _replace(result: Result, target: Path, work: Path) -> None:
-    """Write a result in a work folder, move the old one in and the new one out."""
-    new, old = work / staging.NEW, work / staging.OLD
-    try:
-        new.mkdir()
-        _write(result, new)
-        with contextlib.suppress(OSError):
-            target.rmdir()  # an empty folder
-        if target.exists():
-            os.rename(target, old)
-        os.rename(new, target)
-    except BaseException:
-        if old.exists() and not target.exists():
-            os.rename(old, target)
-        raise
+def rescue(result: Result, path: str | os.PathLike[str]) -> Path | None:
+    """Write a result that could not be saved at its place to another: return where, if any."""
+    name = Path(path).name or "out"
+    for home in (tempfile.gettempdir, os.getcwd, Path.home):
+        with contextlib.suppress(OSError, RuntimeError, MemoryError, BadInput):
+            folder = Path(tempfile.mkdtemp(prefix="lmdsl-", dir=home()))
+            try:
+                save(result, folder / name)
+            except BaseException:
+                folder.rmdir()
+                raise
+            return folder / name
+    return None
 
 
-def _write(result: Result, folder: Path) -> None:
-    problem = result.problem
+def _contents(result: Result) -> dict[str, bytes]:
+    """Return the files of a result but its certificate."""
+    problem, contents = result.problem, {}
     if isinstance(problem.system, FunctionSystem):
         data = problem.model_dump(mode="json", exclude_none=True)
-        if result.lp is not None:
-            _write_synced(folder / "model.npz", _npz(_model_arrays(result.lp)))
+        if result.lp is None:
+            raise BadInput(
+                "this result of a Python function was read from a directory, which holds its "
+                "compiled rows; copy that directory"
+            )
+        contents["model.npz"] = arrays.packed(_model_arrays(result.lp))
     else:
         data = problem.to_dict()
-    _write_synced(folder / "problem.json", _text(data))
-    arrays = {name: getattr(result, name) for name in (*ARRAYS, "witness")}
-    _write_synced(folder / "solution.npz", _npz(arrays))
-    _write_synced(folder / "certificate.json", _text(_certificate(result)))
-
-
-def _text(data: Any) -> bytes:
-    text = json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False)
-    return (text + "\n").encode()
-
-
-def _npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w") as archive:  # as np.savez, which may pickle before NumPy 2.2
-        for name, array in arrays.items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content.getbuffer())
-    return buffer.getvalue()
-
-
-def _write_synced(path: Path, content: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
+    contents["problem.json"] = folder.text(data)
+    held = {name: getattr(result, name) for name in (*ARRAYS, "witness")}
+    contents["solution.npz"] = arrays.packed(held)
+    return contents
 
 
 def _certificate(result: Result) -> dict[str, Any]:
@@ -210,30 +144,80 @@ def _model_arrays(lp: StabilizationLP) -> dict[str, NDArray[Any]]:
 # Reading ------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Stored:
+    """What a directory holds.
+
+    Attributes
+    ----------
+    result
+        The result, none of its claims checked.
+    certificate
+        Content of certificate.json.
+    rewritten
+        Files that are not as they were saved, and are no other save's.
+    """
+
+    result: Result
+    certificate: dict[str, Any]
+    rewritten: tuple[str, ...]
+
+
 def load(path: str | os.PathLike[str]) -> Result:
     """Read a result directory without recompiling or checking its claims.
 
     Raises
     ------
     BadInput
-        The directory is unreadable or inconsistent with its problem.
+        The directory is unreadable, inconsistent with its problem, or its files are of several
+        saves.
     """
-    folder = Path(path)
-    if not folder.is_dir():
-        raise BadInput(f"{shown(str(folder), 200)} is not a result directory")
-    problem = _problem(folder)
-    stored = read_certificate(folder)
+    return read(path).result
+
+
+def read(path: str | os.PathLike[str]) -> Stored:
+    """Read a result directory, as :func:`load`, with what else it says."""
+    return folder.read(Path(path), _read)
+
+
+def read_model(
+    path: str | os.PathLike[str], result: Result, expected: Mapping[str, Any]
+) -> dict[str, NDArray[Any]]:
+    """Read arrays of model.npz, of the save that a result was read from."""
+
+    def model(files: Reading) -> dict[str, NDArray[Any]]:
+        if files.certificate.get("model_sha256") != result.model_sha256:
+            raise BadInput("another save replaced the directory; start again", "model.npz")
+        return _arrays(files, "model.npz", expected)
+
+    return folder.read(Path(path), model)
+
+
+def _arrays(files: Reading, name: str, expected: arrays.Expected) -> dict[str, NDArray[Any]]:
+    return arrays.unpacked(files.open(name, arrays.largest(expected)), name, expected)
+
+
+def _read(files: Reading) -> Stored:
+    content = files.open("problem.json", MAX_FILE_BYTES).read()
+    problem = _problem(parsed(files.folder / "problem.json", content))
+    stored = read_certificate(files.certificate)
     partition = Partition.of(problem)
     N = partition.size
     M = min(control_count(problem), 10**40)
     memory.require(64 * N + 8 * M * (2 + len(problem.control_grid)), "arrays of the result")
-    expected = {name: ((N,), kind) for name, kind in TYPES.items()}
-    arrays = read_arrays(folder / "solution.npz", expected)
+    vectors = _arrays(files, "solution.npz", {name: ((N,), kind) for name, kind in TYPES.items()})
+    result = _result(problem, partition, stored, vectors)
+    return Stored(result, stored, tuple(files.rewritten))
+
+
+def _result(
+    problem: Problem, partition: Partition, stored: dict[str, Any], held: dict[str, NDArray[Any]]
+) -> Result:
     vectors = control_vectors(problem)
-    index = arrays["control_index"]
+    index = held["control_index"]
     if index.size and not (index.min() >= -1 and index.max() < len(vectors)):
         raise BadInput("control_index holds an index outside the control grid", "solution.npz")
-    if arrays["cell_status"].max(initial=0) > 6:
+    if held["cell_status"].max(initial=0) > 6:
         raise BadInput("cell_status holds an unknown code", "solution.npz")
     scalars = {
         key: stored[key]
@@ -252,7 +236,7 @@ def load(path: str | os.PathLike[str]) -> Result:
         reasons=tuple(stored["reasons"]),
     )
     bracket = stored["gamma_bar"]
-    known: dict[str, Any] = {**scalars, **arrays}
+    known: dict[str, Any] = {**scalars, **held}
     return Result(
         **known,
         gamma_bar=(float(bracket[0]), float(bracket[1])) if bracket else None,
@@ -286,8 +270,7 @@ def _local(stored: Any) -> LocalCheck | None:
     return LocalCheck(**stored)
 
 
-def _problem(folder: Path) -> Problem:
-    data = read_json(folder / "problem.json")
+def _problem(data: Any) -> Problem:
     system = data.get("system") if isinstance(data, dict) else None
     if not (isinstance(system, dict) and system.get("kind") == "function"):
         return parse_problem(data)
@@ -340,11 +323,10 @@ def _finite(value: Any) -> bool:
     return abs(value) <= sys.float_info.max
 
 
-def read_certificate(folder: Path) -> dict[str, Any]:
-    """Read certificate.json and check that every key has its type."""
-    where = "certificate.json"
-    data = read_json(folder / where, null=True)
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
+def read_certificate(data: dict[str, Any]) -> dict[str, Any]:
+    """Check that every key of certificate.json has its type."""
+    where = folder.COMMIT
+    if data.get("format") != FORMAT:
         raise BadInput(f"not a certificate of format {FORMAT}", where)
     for key, kinds in _SHAPE.items():
         if key not in data or not isinstance(data[key], kinds) or isinstance(data[key], bool):
@@ -368,51 +350,3 @@ def read_certificate(folder: Path) -> dict[str, Any]:
     if not all(isinstance(reason, str) for reason in data["reasons"]):
         raise BadInput("reasons are sentences", where)
     return data
-
-
-def read_arrays(
-    path: Path, expected: Mapping[str, tuple[tuple[int, ...], str]]
-) -> dict[str, NDArray[Any]]:
-    """Read arrays of known shape and type from an .npz file, whatever it claims to hold.
-
-    Raises
-    ------
-    BadInput
-        A member is missing, compressed beyond its size, or not exactly of the expected kind.
-    """
-    where = path.name
-    arrays: dict[str, NDArray[Any]] = {}
-    try:
-        with zipfile.ZipFile(path) as archive:
-            for name, (shape, kind) in expected.items():
-                arrays[name] = _member(archive, name, shape, np.dtype(kind))
-    except BadInput as error:
-        raise BadInput(error.message, f"{where}.{error.where}") from None
-    except KeyError as error:
-        raise BadInput(f"array missing: {shown(str(error))}", where) from None
-    except Exception as error:  # decompressors and header parsers raise what they like
-        if isinstance(error, MemoryError):
-            raise
-        raise BadInput(f"not a readable archive of arrays: {shown(str(error))}", where) from None
-    return arrays
-
-
-def _member(
-    archive: zipfile.ZipFile, name: str, shape: tuple[int, ...], kind: np.dtype[Any]
-) -> NDArray[Any]:
-    info = archive.getinfo(f"{name}.npy")
-    count = int(np.prod(shape, dtype=np.int64))
-    size = count * kind.itemsize
-    if not size <= info.file_size <= size + 4096:
-        raise BadInput(f"holds {info.file_size} bytes where {size} are expected", name)
-    with archive.open(info) as file:
-        version = np.lib.format.read_magic(file)
-        if version != (1, 0):
-            raise BadInput(f"array format {version} is not supported", name)
-        found, fortran, stored = np.lib.format.read_array_header_1_0(file)
-        if found != shape or fortran or stored != kind:
-            raise BadInput(f"is {stored} of shape {found}, not {kind} of shape {shape}", name)
-        content = file.read(size + 1)
-    if len(content) != size:
-        raise BadInput(f"ends after {len(content)} of {size} bytes", name)
-    return np.frombuffer(content, dtype=kind).copy()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import secrets
 import stat
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from lmdsl.errors import BadInput, shown
 
@@ -21,27 +22,51 @@ MAX_ITEMS = 1_000_000
 def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file so that it appears whole or not at all; a long one piece by piece.
 
+    Where a link stands, what it points to is written; a pipe or a device gets the bytes.
+
     Raises
     ------
     BadInput
         The path cannot be written.
     """
-    name = path.parent / f".{path.name[:40]}.{secrets.token_hex(4)}"
+    pieces = [content] if isinstance(content, bytes) else content
     try:
-        handle = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        if path.exists() and not path.is_file() and not path.is_dir():  # a pipe, /dev/stdout
+            with open(path, "wb") as file:
+                file.writelines(pieces)
+            return
+        path = Path(os.path.realpath(path))
+        name = path.with_name(f".{path.name[:40]}.{secrets.token_hex(8)}")
         try:
-            with os.fdopen(handle, "wb") as file:
-                file.writelines([content] if isinstance(content, bytes) else content)
-                file.flush()
-                os.fsync(file.fileno())
+            write_new(name, pieces)
             os.replace(name, path)
         except BaseException:
             with contextlib.suppress(OSError):
                 os.unlink(name)
             raise
     except (OSError, ValueError) as error:
-        reason = (getattr(error, "strerror", None) or str(error)).lower()
-        raise BadInput(f"cannot write {shown(str(path), 200)}: {reason}") from None
+        raise BadInput(f"cannot write {shown(str(path), 200)}: {reason(error)}") from None
+
+
+def write_new(path: Path, pieces: Iterable[bytes]) -> None:
+    """Write a file that must not exist yet, and wait until it is on the disk."""
+    with open(path, "xb") as file:
+        file.writelines(pieces)
+        file.flush()
+        try:
+            os.fsync(file.fileno())
+        except OSError as error:
+            if error.errno not in _NO_SYNC:
+                raise
+
+
+_NO_SYNC = {errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EROFS, errno.EBADF}
+"""What fsync says on file systems that do not know it; other errors mean lost data."""
+
+
+def reason(error: Exception) -> str:
+    """Return what an error of the operating system says, for the end of a sentence."""
+    return (getattr(error, "strerror", None) or str(error)).lower()
 
 
 class _Fault:
@@ -51,14 +76,13 @@ class _Fault:
         self.message = message
 
 
-def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+def read_bytes(path: Path, limit: int = MAX_FILE_BYTES, links: bool = True) -> bytes:
     """Read a regular file of at most ``limit`` bytes; BadInput says why it cannot be read."""
     try:
-        with open(path, "rb", opener=_open_regular) as file:
+        with open_regular(path, links) as file:
             content = file.read(limit + 1)
     except OSError as error:
-        reason = (error.strerror or str(error)).lower()
-        raise BadInput(f"cannot read {shown(str(path), 200)}: {reason}") from None
+        raise BadInput(f"cannot read {shown(str(path), 200)}: {reason(error)}") from None
     except (TypeError, ValueError):
         raise BadInput(f"{shown(str(path), 200)} is not a path") from None
     if len(content) > limit:
@@ -66,15 +90,28 @@ def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
     return content
 
 
-def _open_regular(path: str, flags: int) -> int:
-    # Without O_NONBLOCK, opening a pipe with no writer would hang.
-    descriptor = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
-    mode = os.fstat(descriptor).st_mode
-    if not stat.S_ISREG(mode):
-        os.close(descriptor)
-        what = "it is a directory" if stat.S_ISDIR(mode) else "it is not a regular file"
-        raise OSError(0, what)
-    return descriptor
+def open_regular(path: Path, links: bool = True) -> BinaryIO:
+    """Open a regular file for reading; a pipe or a device is refused without waiting for it.
+
+    Without ``links`` a symbolic link is refused too.
+    """
+    more = sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY"))
+    if not links:
+        if os.path.islink(path):
+            raise OSError(0, "it is a link")
+        more |= getattr(os, "O_NOFOLLOW", 0)
+
+    def opener(path: str, flags: int) -> int:
+        # Without O_NONBLOCK, opening a pipe with no writer would hang.
+        descriptor = os.open(path, flags | more)
+        mode = os.fstat(descriptor).st_mode
+        if not stat.S_ISREG(mode):
+            os.close(descriptor)
+            what = "it is a directory" if stat.S_ISDIR(mode) else "it is not a regular file"
+            raise OSError(0, what)
+        return descriptor
+
+    return open(path, "rb", opener=opener)
 
 
 def read_json(path: Path, null: bool = False) -> Any:
@@ -82,10 +119,15 @@ def read_json(path: Path, null: bool = False) -> Any:
 
     Null is refused unless ``null`` is True.
     """
+    return parsed(path, read_bytes(path), null)
+
+
+def parsed(path: Path, content: bytes, null: bool = False) -> Any:
+    """Parse what was read of a file, which errors name."""
     try:
-        return strict_json(read_bytes(path), null)
+        return strict_json(content, null)
     except BadInput as error:
-        if error.where or error.message.startswith("cannot read"):
+        if error.where:
             raise
         raise BadInput(f"{shown(str(path), 200)}: {error.message}") from None
 

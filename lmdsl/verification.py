@@ -10,7 +10,6 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -153,7 +152,7 @@ def recompiled(
 ) -> StabilizationLP:
     """Return the finite model of a directory made anew; of a Python function, its saved rows."""
     if isinstance(result.problem.system, FunctionSystem):
-        return _stored_model(Path(path), result)
+        return _stored_model(path, result)
     return compile(result.problem, progress)
 
 
@@ -251,7 +250,7 @@ def _policy(lp: StabilizationLP, result: Result) -> np.ndarray[Any, Any] | None:
     return pair
 
 
-def _stored_model(folder: Path, result: Result) -> StabilizationLP:
+def _stored_model(path: str | os.PathLike[str], result: Result) -> StabilizationLP:
     """Rebuild the LP of a Python function from its saved rows."""
     status, problem = result.cell_status, result.problem
     regions = Regions.of(problem, result.partition)
@@ -259,9 +258,9 @@ def _stored_model(folder: Path, result: Result) -> StabilizationLP:
     n, K = len(cells), int(result.pairs or 0)
     memory.require(estimate(problem), "the saved rows")
     nodes, points = noise_nodes(problem), sample_points(problem)
-    path = folder / "model.npz"
-    small = archive.read_arrays(
+    small = archive.read_model(
         path,
+        result,
         {
             "pair_pointer": ((n + 1,), "<i8"),
             "control": ((K,), "<i4"),
@@ -272,7 +271,9 @@ def _stored_model(folder: Path, result: Result) -> StabilizationLP:
     entries = int(small["pointer"][-1])
     if not 0 <= entries <= K * points * len(nodes.weights):
         raise BadInput("pointer is out of range", "model.npz")
-    large = archive.read_arrays(path, {"target": ((entries,), "<i4"), "code": ((entries,), "<u4")})
+    large = archive.read_model(
+        path, result, {"target": ((entries,), "<i4"), "code": ((entries,), "<u4")}
+    )
     shares = Shares.of(points, nodes)
     rows = Rows(
         small["pointer"],

@@ -21,7 +21,7 @@ from pathlib import Path
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import archive, staging
+from lmdsl import archive, saving
 from lmdsl.result import ARRAYS
 
 GAMMAS = (1.0, 1.01, 1.02)  # save k has GAMMAS[k % 3]: the saves before and after it differ
@@ -35,27 +35,17 @@ def gamma_held(target: Path, results: list[lm.Result]) -> float | None:
     """Return the gamma of a whole result directory, None if there is no directory."""
     if not target.exists():
         return None
-    held = sorted(path.name for path in target.iterdir())
-    assert held == ["certificate.json", "problem.json", "solution.npz"], held
-    gamma = json.loads((target / "problem.json").read_text())["gamma"]
-    assert json.loads((target / "certificate.json").read_text())["gamma"] == gamma
     loaded = lm.Result.load(target)
-    expected = results[GAMMAS.index(gamma)]
+    assert loaded.problem.gamma == loaded.gamma
+    expected = results[GAMMAS.index(loaded.gamma)]
     for name in (*ARRAYS, "witness"):
         assert getattr(loaded, name).tobytes() == getattr(expected, name).tobytes(), name
-    return gamma
+    return loaded.gamma
 
 
 def leftovers(target: Path) -> list[Path]:
-    return [path for path in target.parent.iterdir() if path != target]
-
-
-def put_back(target: Path, results: list[lm.Result]) -> set[float | None]:
-    """Return what the next save may put back first: a result moved away, and not yet replaced."""
-    if target.exists():
-        return set()
-    moved = [work / staging.OLD for work in leftovers(target) if (work / staging.NEW).exists()]
-    return {gamma_held(old, results) for old in moved if old.exists()}
+    inside = list(target.glob(".*")) if target.exists() else []
+    return inside + [path for path in target.parent.iterdir() if path != target]
 
 
 def at_line(number: int, act) -> None:
@@ -63,7 +53,7 @@ def at_line(number: int, act) -> None:
     left = itertools.count(number - 1, -1)
 
     def trace(frame, event, _):
-        if frame.f_code.co_filename not in (archive.__file__, staging.__file__):
+        if frame.f_code.co_filename not in (archive.__file__, saving.__file__):
             return None
         if event == "line" and next(left) == 0:
             act()
@@ -115,7 +105,6 @@ def random_kills(target: Path, kills: int, seed: int) -> dict:
         if kill % 4 == 0:
             shutil.rmtree(target, ignore_errors=True)
         held = gamma_held(target, results)
-        moved = put_back(target, results)
         first = 0 if held is None else GAMMAS.index(held) + 1
         reading, writing = os.pipe()
         child = forked(lambda: saved_forever(results, target, first, writing))  # noqa: B023
@@ -131,22 +120,22 @@ def random_kills(target: Path, kills: int, seed: int) -> dict:
         before = held if not done else GAMMAS[(first + done - 1) % 3]
         after = GAMMAS[(first + done) % 3]
         held = gamma_held(target, results)
-        assert held in {before, after, None} | (set() if done else moved), (kill, before, after)
+        assert held in {before, after}, (kill, before, after)
         found["left behind"] += bool(leftovers(target))
-        if held is None:
-            found["none, none before" if before is None else "none, one before"] += 1
-        else:
-            found["new" if held == after else "old" if held == before else "put back"] += 1
+        found["none" if held is None else "new" if held == after else "old"] += 1
         found["saves finished"] += done
     return finish(target, results, found, duration)
 
 
-def kills_at_every_line(target: Path) -> dict:
-    """Kill just before each line of the module that save executes, over an older directory."""
+def kills_at_every_line(target: Path, new: bool) -> dict:
+    """Kill just before each line of the modules that save executes, over an older directory."""
     results = solved()
     found: Counter[str] = Counter()
     for line in itertools.count(1):
-        results[0].save(target)
+        if new:
+            shutil.rmtree(target, ignore_errors=True)
+        else:
+            results[0].save(target)
 
         def work(line: int = line) -> None:
             at_line(line, lambda: os.kill(os.getpid(), signal.SIGKILL))
@@ -155,21 +144,18 @@ def kills_at_every_line(target: Path) -> dict:
         if not reap(forked(work)):
             break
         held = gamma_held(target, results)
-        assert held in (GAMMAS[0], GAMMAS[1], None)
+        assert held in ((None if new else GAMMAS[0]), GAMMAS[1])
         left = leftovers(target)
-        assert len(left) <= 1
-        found["left behind"] += len(left)
-        if held is None:  # the next save would put the old one back first
-            staging.clear(target, archive.FILES)
-            assert gamma_held(target, results) == GAMMAS[0]
-        found["none" if held is None else "new" if held == GAMMAS[1] else "old"] += 1
+        assert len(left) <= (3 if new else 4)
+        found["left behind"] += bool(left)
+        found["new" if held == GAMMAS[1] else "old"] += 1
     return finish(target, results, found)
 
 
 def finish(target: Path, results: list[lm.Result], found: Counter[str], seconds=None) -> dict:
     """Save once more among what the killed processes left, and verify."""
     left = leftovers(target)
-    assert all(path.name.startswith(f".{target.name}.") for path in left)
+    assert all(path.name.startswith(".") for path in left)
     results[2].save(target)
     assert gamma_held(target, results) == GAMMAS[2]
     assert lm.verify(target).holds

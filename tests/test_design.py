@@ -18,7 +18,9 @@ PACKAGE = Path(lm.__file__).parent
 ORDER = """
 errors frozen forking surroundings
 kernels
-files staging quiet
+files arrays quiet
+folder
+saving
 formulas
 intervals
 jets

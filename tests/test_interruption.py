@@ -6,13 +6,10 @@ import itertools
 import json
 import os
 import select
-import shutil
 import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 
 import interrupted_saves
@@ -22,7 +19,7 @@ from models import mdp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import archive, feasibility, gamma, linear, policy, staging
+from lmdsl import feasibility, gamma, linear, policy, saving
 
 HERE = Path(__file__).parent
 posix = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and signals")
@@ -43,8 +40,7 @@ def killing(*arguments):
 def test_killed_at_random_moments(tmp_path):
     found = killing("random", tmp_path, 200, 0)
     print(found)
-    outcomes = ("old", "new", "put back", "none, none before", "none, one before")
-    assert sum(found.get(name, 0) for name in outcomes) == 200
+    assert sum(found.get(name, 0) for name in ("old", "new", "none")) == 200
     assert found["old"] > 0  # kills did fall into saves
     assert found["left behind"] > 0
     assert found["saves finished"] > 0
@@ -52,18 +48,21 @@ def test_killed_at_random_moments(tmp_path):
 
 @posix
 @pytest.mark.long
-def test_killed_at_every_line(tmp_path):
-    found = killing("lines", tmp_path)
+@pytest.mark.parametrize("new", [0, 1])
+def test_killed_at_every_line(tmp_path, new):
+    """There is the old result or the new one, whole, also between any two renames."""
+    found = killing("lines", tmp_path, new)
     print(found)
     assert found["old"] > 30
     assert found["new"] >= 1
-    assert found.get("none", 0) <= 2  # between the two renames
-    assert found["left behind"] > 30
+    assert found["left behind"] > 5
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # from the tracing
-def test_interrupted_at_every_line_of_a_save(tmp_path):
+def test_interrupted_at_every_line_of_a_save(tmp_path, monkeypatch):
     """Ctrl-C during a save never loses the directory: it is the old one or the new one."""
+    monkeypatch.setattr(saving, "PATIENCE", 0.0)  # a lock may stay until the process ends
+    monkeypatch.setattr(os, "fsync", lambda _: None)
     results = interrupted_saves.solved()
     target = tmp_path / "out"
 
@@ -84,123 +83,10 @@ def test_interrupted_at_every_line_of_a_save(tmp_path):
             sys.settrace(tracer)
         assert interrupted_saves.gamma_held(target, results) in (1.0, 1.01)
         left += bool(interrupted_saves.leftovers(target))
-        for path in interrupted_saves.leftovers(target):
-            assert path.name.startswith(".out.")
-            shutil.rmtree(path)
     print(interruptions, left)
     assert interruptions > 30
-    assert left <= 15  # an interrupted clean-up
-
-
-# What a killed save leaves ------------------------------------------------------------------
-
-
-def abandoned(target):
-    """A work folder as a process leaves it that is killed: there, and not locked."""
-    with staging.beside(target) as work:
-        pass
-    work.mkdir()
-    return work
-
-
-def stale(target, old=None):
-    """What a save leaves that was killed while it wrote, or between its two renames."""
-    work = abandoned(target)
-    (work / "new").mkdir()
-    (work / "new" / "problem.json").write_text("{")
-    if old is not None:
-        old.save(work / "old")
-    return work
-
-
-@posix
-def test_leftovers_are_removed_by_the_next_save(tmp_path):
-    results = interrupted_saves.solved()
-    target = tmp_path / "out"
-    stale(target)
-    abandoned(target)
-    stale(target, results[0])
-    results[1].save(target)
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-    assert interrupted_saves.gamma_held(target, results) == 1.01
-
-
-@posix
-def test_an_old_result_goes_back_to_its_place(tmp_path):
-    results = interrupted_saves.solved()
-    target = tmp_path / ("a long name " * 8)
-    stale(target, results[0])
-    staging.clear(target, archive.FILES)
-    assert interrupted_saves.gamma_held(target, results) == 1.0
+    assert left <= 20  # an interrupted clean-up, or files that the certificate needs
     assert interrupted_saves.leftovers(target) == []
-    stale(target, results[1])  # in place is the newer one, or one of another's making
-    staging.clear(target, archive.FILES)
-    assert interrupted_saves.gamma_held(target, results) == 1.0
-    shutil.rmtree(target)  # the user's own wish, after a save that was killed while it tidied up
-    shutil.rmtree(stale(target, results[1]) / "new")
-    staging.clear(target, archive.FILES)
-    assert list(tmp_path.iterdir()) == []
-    # A failed save after a killed one: the old result is there.
-    stale(target, results[0])
-    broken = replace(results[1], value=np.array([object()]))
-    with pytest.raises(ValueError, match=r"allow_pickle|Object arrays"):
-        broken.save(target)
-    assert interrupted_saves.gamma_held(target, results) == 1.0
-
-
-@posix
-def test_what_is_not_a_leftover_stays(tmp_path):
-    (result, *_) = interrupted_saves.solved()
-    target = tmp_path / "out"
-    kept = []
-    for name in (
-        "out.12345678",
-        ".out.1234567",
-        ".out.123456789",
-        ".out.ABCDEFGH",
-        ".out2.12345678",
-    ):
-        (tmp_path / name / "new").mkdir(parents=True)
-        kept.append(name)
-    with staging.beside(target) as alive:  # a save at work
-        (alive / "new").mkdir()
-        foreign = stale(target)
-        (foreign / "notes.txt").write_text("mine")
-        deeper = stale(target)
-        (deeper / "new" / "notes.txt").write_text("mine")
-        away = tmp_path / "away"
-        away.mkdir()
-        (away / "problem.json").write_text("{}")
-        linked = stale(target)
-        (linked / "old").symlink_to(away)
-        (tmp_path / ".out.symlink0").symlink_to(away)
-        (tmp_path / ".out.file0000").write_text("mine")
-        result.save(target)
-        left = {path.name for path in tmp_path.iterdir()} - set(kept) - {"out"}
-        assert left == {
-            alive.name, foreign.name, deeper.name, linked.name, "away", ".out.symlink0",
-            ".out.file0000",
-        }  # fmt: skip
-    assert (foreign / "notes.txt").read_text() == (deeper / "new" / "notes.txt").read_text()
-    assert (away / "problem.json").exists()
-    result.save(target)
-    assert not alive.exists()  # now it is one
-
-
-@posix
-def test_saves_at_the_same_time(tmp_path):
-    """Saves that clear while others work never break one another's folder."""
-    results = interrupted_saves.solved()
-    targets = [tmp_path / "out" for _ in range(4)]
-    with ThreadPoolExecutor(4) as pool:
-        for _ in range(5):
-            jobs = [pool.submit(results[k % 3].save, t) for k, t in enumerate(targets)]
-            for job in jobs:
-                # Two that replace the same directory at once: one may find it not empty.
-                assert job.exception() is None or isinstance(job.exception(), lm.BadInput)
-    assert interrupted_saves.gamma_held(targets[0], results) in (1.0, 1.01, 1.02)
-    results[0].save(targets[0])
-    assert interrupted_saves.leftovers(targets[0]) == []
 
 
 # Ctrl-C -------------------------------------------------------------------------------------

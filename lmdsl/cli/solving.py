@@ -9,7 +9,7 @@ from typing import Any
 
 from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
 from lmdsl.cli.streams import say, tell
-from lmdsl.errors import plain_text, printable
+from lmdsl.errors import LmdslError, plain_text, printable
 
 STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
 """Runs of the true map that follow a solve: how many, how long, and how long all together."""
@@ -57,7 +57,7 @@ def _problem(parsed: Arguments) -> Any:
 
 def _solve(parsed: Arguments) -> int:
     if parsed.out is not None:
-        from lmdsl.archive import refuse_unless_free
+        from lmdsl.saving import refuse_unless_free
 
         refuse_unless_free(parsed.out)
     problem = _problem(parsed)
@@ -74,15 +74,13 @@ def _solve(parsed: Arguments) -> int:
             restrict_to_gamma=parsed.restrict_to_gamma,
             progress=progress,
         )
-    saved = parsed.out is not None and result.lp is not None  # else there was no time to compile
     tell(result.log)
-    if not parsed.json:
+    if not parsed.json:  # reported first: whatever saving meets, the answer was given
         say(_summary(result))
-    if saved:
-        result.save(parsed.out)
-        if not parsed.json:
-            say(f"written to {printable(parsed.out)}")
-    try:  # what is known by now is known whatever becomes of the simulation
+    status = int(result.exit_status)
+    try:  # what is known by now is known whatever becomes of saving and simulation
+        if parsed.out is not None and result.lp is not None:  # else no time to compile
+            status = _saved(result, parsed)
         if parsed.simulate:
             result = _simulated(result)
     finally:
@@ -91,6 +89,22 @@ def _solve(parsed: Arguments) -> int:
     if result.simulation and not parsed.json:
         word = "verified" if result.verified else "not verified"
         say(f"{word} on the finite model; {result.simulation.sentence()}")
+    return status
+
+
+def _saved(result: Any, parsed: Arguments) -> int:
+    """Save a result, elsewhere if it cannot be at its place; return the exit status."""
+    from lmdsl.archive import rescue
+
+    try:
+        result.save(parsed.out)
+    except (LmdslError, MemoryError) as error:
+        found = rescue(result, parsed.out)
+        where = "nothing was saved" if found is None else f"the result was saved in {found}"
+        print(printable(f"lmdsl: {str(error) or 'out of memory'}; {where}"), file=sys.stderr)
+        return 2
+    if not parsed.json:
+        say(f"written to {printable(parsed.out)}")
     return int(result.exit_status)
 
 
