@@ -441,7 +441,9 @@ def _numbers(ax: Any, result: Result) -> None:
     def known(value: float | None, digits: int = 6) -> str:
         return "unknown" if value is None else number(value, digits)
 
-    cells = f"{result.stabilizable_cells} of {result.cells} stabilizable"
+    covered, cells = result.coverage, str(result.cells)
+    if covered is not None:
+        cells = f"{covered.stabilizable} of {covered.free} free stabilizable"
     rows = [
         ("status", result.status.replace("_", " ")),
         ("backend", plain(result.backend or "none", 30)),

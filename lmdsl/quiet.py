@@ -130,7 +130,8 @@ class _Diverted:
             os.dup2(self.kept, 1)
             os.close(self.kept)
             self.kept = None
-        self.log.close()
+        with contextlib.suppress(OSError):
+            self.log.close()
 
     def size(self) -> int:
         """Return how much was printed."""
@@ -160,7 +161,9 @@ class _Split:
     def write(self, text: str) -> int:
         with _lock:
             target = self._target()
-            return len(text) if target is None else target.write(text)
+            with contextlib.suppress(OSError) if target is self.log else contextlib.nullcontext():
+                return len(text) if target is None else int(target.write(text))
+            return len(text)  # there is no room for the log
 
     def flush(self) -> None:
         with _lock:

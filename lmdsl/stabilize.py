@@ -211,7 +211,10 @@ def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[str, str]
         return "measure", "no cell of measure is stabilizable; enlarge its boxes"
     outside = lp.partition.size - lp.n - int(np.isin(lp.cell_status, (0, 5)).sum())
     if require_all and outside:
-        return "require_all", f"{outside} cells outside A and Z are not stabilizable"
+        return (
+            "require_all",
+            f"{outside} of {lp.n + outside} cells outside A and Z are not stabilizable",
+        )
     return None
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import io
 import json
 import os
@@ -304,6 +305,17 @@ def test_a_long_log_is_cut():
     with quiet.foreign() as printed:
         pass
     assert printed() == ""
+
+
+@posix
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="there is no full disk")
+def test_a_full_disk_does_not_matter(monkeypatch, capfd):
+    full = functools.partial(open, "/dev/full", "w+b", buffering=0)
+    monkeypatch.setattr(quiet, "_file", full)
+    result = lm.solve(made(steps()), shouting("NOISE\n" * 10_000))
+    assert result.verified
+    assert result.log == ""
+    assert capfd.readouterr() == ("", "")
 
 
 def test_escapes():
