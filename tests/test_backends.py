@@ -4,6 +4,7 @@ Driven by one table: a new backend adds its specs there, no test. The standard m
 policy iteration.
 """
 
+import contextlib
 import json
 import os
 import re
@@ -248,6 +249,19 @@ def test_ctrl_c_ends_ipopt_and_the_solve():
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         timer.cancel()
+        signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_that_casadi_swallows_is_raised():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), ipopt_backend._interruptible():
+            with contextlib.suppress(KeyboardInterrupt):
+                signal.raise_signal(signal.SIGINT)
+        with ipopt_backend._interruptible():
+            pass
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
         signal.signal(signal.SIGINT, before)
 
 

@@ -15,13 +15,15 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
-from lmdsl.lp import StabilizationLP
+
+if TYPE_CHECKING:
+    from lmdsl.lp import StabilizationLP
 
 FIXED = {
     "mehrotra_algorithm": "yes",
@@ -67,13 +69,14 @@ STOPS = {
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:
     """Solve with Ipopt."""
+    return ScaledLP.of(lp).solved(_solved, options)
+
+
+def _solved(scaled: ScaledLP, options: Options) -> Solution:
     import casadi
 
-    scaled = ScaledLP.of(lp)
     try:
         solver = _solver(casadi, scaled.A, scaled.c, _options(options, scaled))
-        if scaled.late(options.time_limit):
-            return scaled.too_late()
         with _interruptible():
             found = solver(x0=1, lbx=0, ubx=np.inf, lbg=scaled.b, ubg=scaled.b)
         stats = solver.stats()
@@ -89,7 +92,10 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Raise KeyboardInterrupt where Ctrl-C ended Ipopt: CasADi takes it for a failure."""
+    """Raise KeyboardInterrupt where Ctrl-C ended Ipopt: CasADi takes it for a failure.
+
+    So it is where Ipopt runs in this process.
+    """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield
