@@ -48,6 +48,8 @@ def ask(
     BadInput
         The backend refuses the options, or a package is missing.
     """
+    if options.max_iterations is not None:  # solvers take 32-bit integers
+        options = replace(options, max_iterations=min(int(options.max_iterations), 2**31 - 1))
     if backend.capabilities.silent and backends.ours(backend):
         return *_ask(lp, backend, options), ""
     progress = options.progress and quiet.ours(options.progress)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl import bellman
+from lmdsl import bellman, inputs
 from lmdsl.deadline import TimeLimitReached
 from lmdsl.errors import BadInput, printable, shown
 from lmdsl.lp import StabilizationLP, compile
@@ -140,6 +140,7 @@ def compare(
     """
     if isinstance(backends, str):
         raise BadInput(f"name the backends in a list: [{shown(backends)}]", "backends")
+    inputs.kind(backends, Sequence, "backends", "a list of backends")
     if not isinstance(problem, Problem | StabilizationLP):
         raise BadInput(f"{shown(problem)} is neither a Problem nor a compiled LP", "problem")
     if not backends:

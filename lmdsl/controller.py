@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lmdsl import inputs, memory
 from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput, shown
 from lmdsl.frozen import Frozen
@@ -55,8 +56,9 @@ class Controller(Frozen):
         Parameters
         ----------
         x
-            Shape (..., d), in the order of the axes. Periodic axes wrap; under ``on_exit: clip``
-            a state outside the box has the control of the nearest one inside.
+            Shape (..., d), in the order of the axes; or by name, in any order: a mapping from axes
+            to arrays, a table with these columns. Periodic axes wrap; under ``on_exit: clip`` a
+            state outside the box has the control of the nearest one inside.
 
         Returns
         -------
@@ -64,14 +66,8 @@ class Controller(Frozen):
             NaN where there is no control: off the stabilizable set, outside the box, and, without
             a local controller, on the attractor cells.
         """
-        try:
-            states = np.asarray(x, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise BadInput(f"{shown(x)} is no array of states") from None
-        d = self.partition.dimension
-        if states.shape[-1:] != (d,):
-            raise BadInput(f"states have shape (..., {d}), not {states.shape}")
-        flat = self.partition.states(states.reshape(-1, d))
+        states = inputs.states(x, self.partition.names)
+        flat = self.partition.states(states.reshape(-1, self.partition.dimension))
         cell = self.partition.locate(list(flat.T))
         return self.at(cell, flat).reshape(*states.shape[:-1], self.vectors.shape[1])
 
@@ -80,9 +76,16 @@ class Controller(Frozen):
 
         The local controller needs the states x, shape (r, d), and not only their cells.
         """
+        cell = np.atleast_1d(cell)
+        if cell.dtype.kind not in "iu" or cell.ndim != 1:
+            raise BadInput(f"{shown(cell)} are no indices of cells, shape (r,)", "cell")
+        if cell.size and not (cell.min() >= -1 and cell.max() < len(self.index)):
+            raise BadInput(f"cells are 0..{len(self.index) - 1}, or -1 for none", "cell")
         index = np.where(cell >= 0, self.index[cell], -1)
         u = np.where(index[:, None] >= 0, self.vectors[index], np.nan)
         if self.local is not None and x is not None:
+            if np.shape(x) != (len(cell), self.partition.dimension):
+                raise BadInput(f"{len(cell)} cells, but states of shape {np.shape(x)}", "x")
             inside = (cell >= 0) & self.local.attractor[cell]
             u[inside] = self.local(x[inside], cell[inside])
         return u
@@ -295,8 +298,11 @@ class ClosedLoop:
     @own_arithmetic
     def path(self, x: ArrayLike, steps: int, seed: int = 0) -> Floats:
         """Return the states of one run, shape (steps taken + 1, d), ending in A or with a loss."""
-        rng = np.random.default_rng(seed)
-        state, cell = self.enter(np.asarray(x, dtype=np.float64).reshape(1, -1))
+        start, steps = inputs.states(x, self.partition.names, "x"), inputs.whole(steps, "steps", 0)
+        if start.size != self.partition.dimension or not np.isfinite(start).all():
+            raise BadInput("a path starts in one state of finite numbers", "x")
+        rng = np.random.default_rng(inputs.seed(seed))
+        state, cell = self.enter(start.reshape(1, -1))
         states = [state[0]]
         while len(states) <= steps and cell[0] >= 0 and self.status[cell[0]] == 1:
             state, cell = self.step(state, cell, rng)
@@ -338,6 +344,7 @@ def simulate(
     late
         When to stop: the runs that have not ended by then count as cycling.
     """
+    memory.require(starts * (100 * loop.partition.dimension + 100), "runs")
     rng = np.random.default_rng(seed)
     if not len(cells) or not weight.any():
         raise BadInput("there is no stabilizable cell to start from")

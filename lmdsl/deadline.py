@@ -17,6 +17,10 @@ class TimeLimitReached(LmdslError, TimeoutError):
         super().__init__(f"time limit reached while {doing}; raise the limit or make less work")
 
 
+FOREVER = 1e10
+"""Seconds after which no limit matters: three centuries."""
+
+
 class Deadline:
     """A moment on the monotonic clock after which no more work is wanted.
 
@@ -44,7 +48,7 @@ class Deadline:
         number = isinstance(limit, float | int | np.floating | np.integer) and limit is not True
         if limit is not None and not (number and limit > 0):
             raise BadInput(f"{shown(limit)} must be a number of seconds > 0", "time_limit")
-        return cls(limit)
+        return cls(None if limit is None else float(min(limit, FOREVER)))
 
     def again(self) -> Deadline:
         """Return a deadline for finishing: as long again from now on, at least two seconds."""

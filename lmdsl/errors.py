@@ -50,7 +50,15 @@ def shown(value: object, limit: int = 60) -> str:
         return f"a {type(value).__name__} of {len(value)} items"
     if isinstance(value, str) and len(value) > limit:
         value = value[:limit] + "..."
-    text = ascii(value)
+    shape = getattr(value, "shape", ())
+    if isinstance(shape, tuple) and shape:
+        return f"an array of shape {shape}"
+    try:
+        text = ascii(value)
+    except Exception:  # somebody else's object
+        text = f"a {type(value).__name__}"
+    if "\n" in text:
+        text = " ".join(text.split())
     return text if len(text) <= 2 * limit else text[: 2 * limit] + "..."
 
 

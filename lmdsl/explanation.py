@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import boxes, facts, graph
+from lmdsl import boxes, facts, graph, inputs
 from lmdsl.boxes import Region
 from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.errors import BadInput, shown
@@ -148,7 +148,11 @@ class Explanation(Frozen):
             if i < 0:
                 raise BadInput(f"{shown(dict(cell))} lies outside the state box", "cell")
             return int(i)
-        if not isinstance(cell, int | np.integer) or not 0 <= cell < p.size:
+        if (
+            isinstance(cell, bool)
+            or not isinstance(cell, int | np.integer)
+            or not (0 <= cell < p.size)
+        ):
             raise BadInput(f"{shown(cell)} is not a cell; cells are 0..{p.size - 1}", "cell")
         return int(cell)
 
@@ -232,9 +236,9 @@ def explain(
     LmdslError
         The phase-one LP is not solved.
     """
+    inputs.kind(problem, (Problem, StabilizationLP), "problem", "a Problem or a compiled LP")
     deadline = Deadline.of(time_limit)
-    if not isinstance(regions, int | np.integer) or regions < 1:
-        raise BadInput(f"{shown(regions)} is not a whole number >= 1", "regions")
+    regions = inputs.whole(regions, "regions")
     assembled = None
     if isinstance(problem, StabilizationLP):
         partition, status = problem.partition, problem.cell_status.copy()

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bounds, feasibility, growth, policy
+from lmdsl import bounds, feasibility, growth, inputs, policy
 from lmdsl.boxes import Area
 from lmdsl.deadline import Deadline
 from lmdsl.frozen import Frozen
@@ -159,6 +159,7 @@ def gamma_max(
     TimeLimitReached
         It was not compiled in time.
     """
+    inputs.kind(problem, (Problem, StabilizationLP), "problem", "a Problem or a compiled LP")
     deadline = Deadline.of(time_limit)
     lp = compile(problem, progress, deadline) if isinstance(problem, Problem) else problem
     if progress:

@@ -10,13 +10,12 @@ from __future__ import annotations
 import hashlib
 import os
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import graph
+from lmdsl import graph, inputs
 from lmdsl.deadline import Deadline
 from lmdsl.directions import Directions
 from lmdsl.errors import BadInput
@@ -151,23 +150,34 @@ class StabilizationLP(Frozen):
         inside
             Positions of the cells to keep, ascending; each must keep a column.
         """
+        columns = inputs.indices(columns, self.K, "columns", "columns")
+        inside = inputs.indices(inside, self.n, "inside", "positions")
         renumber = np.full(self.n + 1, -1, dtype=np.int32)
         renumber[inside] = np.arange(len(inside), dtype=np.int32)
         renumber[self.n] = len(inside)
         taken = self.rows.take(columns)
-        count = np.bincount(renumber[self.cell[columns]], minlength=len(inside))
+        own, reached = renumber[self.cell[columns]], renumber[taken.target]
+        if len(own) and min(own.min(), reached.min(initial=0)) < 0:
+            raise BadInput("a column belongs or leads to a cell that is left out", "inside")
+        count = np.bincount(own, minlength=len(inside))
         return replace(
             self,
             cells=self.cells[inside],
             pair_pointer=np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
             control=self.control[columns],
-            rows=replace(taken, target=renumber[taken.target], columns=len(inside)),
+            rows=replace(taken, target=reached, columns=len(inside)),
             cost=self.cost[columns],
             weight=self.weight[inside],
         )
 
     def under(self, pair: NDArray[np.int64]) -> StabilizationLP:
         """Return the model under a policy, a column per cell: its only policy is ``arange(n)``."""
+        pair = inputs.indices(pair, self.K, "pair", "columns")
+        if (
+            len(pair) != self.n
+            or not ((pair >= self.pair_pointer[:-1]) & (pair < self.pair_pointer[1:])).all()
+        ):
+            raise BadInput("a policy names one column of each cell's own", "pair")
         return replace(
             self,
             pair_pointer=np.arange(self.n + 1, dtype=np.int64),
@@ -226,6 +236,9 @@ class StabilizationLP(Frozen):
 
     def expand(self, values: NDArray[Any], attractor: Any, outside: Any) -> NDArray[Any]:
         """Spread values on C over all N cells."""
+        values = np.asarray(values)
+        if values.shape != (self.n,):
+            raise BadInput(f"values on C have shape ({self.n},), not {values.shape}", "values")
         full = np.full(self.partition.size, outside, dtype=values.dtype)
         full[self.cell_status == CellStatus.ATTRACTOR] = attractor
         full[self.cells] = values
@@ -252,7 +265,7 @@ class StabilizationLP(Frozen):
             ]
         lines.append("RHS")
         lines += [f" m {names[i]} {float(self.b[i])!r}" for i in np.flatnonzero(self.b)]
-        write_whole(Path(path), ("\n".join([*lines, "ENDATA"]) + "\n").encode())
+        write_whole(inputs.path(path), ("\n".join([*lines, "ENDATA"]) + "\n").encode())
 
     def __repr__(self) -> str:
         return (
@@ -287,6 +300,7 @@ def compile(  # noqa: A001
         does not fit in memory.
     """
     deadline = Deadline.of(time_limit)
+    inputs.kind(problem, Problem, "problem", "a Problem")
     partition = Partition.of(problem)
     if problem.local_controller is not None:  # refuse a wrong one before the work
         LocalController.of(problem, partition, Regions.of(problem, partition).attractor)

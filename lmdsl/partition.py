@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl import inputs
 from lmdsl.axis import EDGE, Axis
-from lmdsl.errors import BadInput
+from lmdsl.errors import BadInput, shown
 from lmdsl.forking import cached_property
 from lmdsl.frozen import Frozen
 from lmdsl.problem import Problem
@@ -104,12 +105,31 @@ class Partition(Frozen):
         Parameters
         ----------
         images
-            One array per axis; they broadcast against each other.
+            One array per axis; they broadcast against each other. Or one array of points, shape
+            (..., d), where that can mean nothing else.
         clip
             Saturate finite images into the box; default: as the problem's ``on_exit`` says.
         """
-        index = self.index(images, clip)
+        index = self.index(self._by_axis(images), clip)
         return np.where(index >= 0, index, -1.0).astype(np.int64)
+
+    def _by_axis(self, images: Sequence[Floats]) -> Sequence[Floats]:
+        d = self.dimension
+        if isinstance(images, np.ndarray) and images.ndim > 1 and images.shape[-1] == d:
+            if len(images) == d > 1:
+                raise BadInput(
+                    f"an array of shape {images.shape} may hold {d} points or {d} axes; pass "
+                    "list(X.T) for points in rows, list(X) for axes in rows",
+                    "images",
+                )
+            return list(np.moveaxis(images, -1, 0))
+        if not hasattr(images, "__len__") or len(images) != d:
+            raise BadInput(
+                f"{shown(images)} is not one array for each of {d} axes; pass list(X.T) for points "
+                "in rows",
+                "images",
+            )
+        return images
 
     def index(self, images: Sequence[Floats], clip: bool | None = None) -> Floats:
         """Return the cell of every image as a double, NaN outside the box or where not finite.
@@ -179,7 +199,7 @@ class Partition(Frozen):
 
     def multi_index(self, cell: NDArray[np.integer]) -> tuple[Indices, ...]:
         """Return the index of each cell on every axis."""
-        return np.unravel_index(cell, self.shape)
+        return np.unravel_index(inputs.indices(cell, self.size, "cell"), self.shape)
 
     def centres(self, cell: NDArray[np.integer]) -> Floats:
         """Return the centres of cells, shape (len(cell), d)."""

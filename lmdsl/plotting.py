@@ -14,12 +14,12 @@ import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
 from io import BytesIO
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lmdsl import inputs
 from lmdsl.drawing import layers, runs
 from lmdsl.drawing.view import At, Floats, View, number, plain
 from lmdsl.errors import BadInput, shown
@@ -78,10 +78,11 @@ def portrait(
     -------
     matplotlib.axes.Axes
     """
+    inputs.kind(problem, (Problem, _result()), "problem", "a Problem or a Result")
     given = problem if isinstance(problem, Problem) else problem.problem
     for name, count in (("starts", starts), ("steps", steps)):
-        if count is not None and count < 1:
-            raise BadInput(f"{count} is not a positive number", name)
+        if count is not None:
+            inputs.whole(count, name)
     partition = Partition.of(given)
     attractor = Regions.of(given, partition).attractor
     view = View.of(partition, attractor, axes, at)
@@ -180,6 +181,9 @@ def causes(
     -------
     matplotlib.axes.Axes
     """
+    from lmdsl.explanation import Explanation
+
+    inputs.kind(explanation, Explanation, "explanation", "what lmdsl.explain returns")
     status = explanation.cell_status
     view = View.of(explanation.partition, status == CellStatus.ATTRACTOR, axes, at)
     drawn: Axes = layers.frame(ax, view, "cells that cannot be stabilized" + view.note)
@@ -224,6 +228,7 @@ def control(
     BadInput
         There is no such control.
     """
+    inputs.kind(result, _result(), "result", "a Result")
     names = result.problem.controls
     if not names:
         raise BadInput("the system is autonomous: it has no control to draw", "control_grid")
@@ -321,6 +326,7 @@ def trajectories(
     -------
     matplotlib.axes.Axes
     """
+    steps, seed = inputs.whole(steps, "steps"), inputs.seed(seed)
     view = _view(result, axes, at)
     drawn: Axes = layers.frame(ax, view, "closed loop")
     status = result.cell_status
@@ -380,7 +386,8 @@ def figure(
     BadInput
         The ending is unknown, or the file cannot be written.
     """
-    target = None if path is None else Path(path)
+    seed = inputs.seed(seed)
+    target = None if path is None else inputs.path(path)
     kind = "" if target is None else target.suffix[1:].lower()
     if target is not None and kind not in FORMATS:
         raise BadInput(f"{shown(str(target), 200)}: a plot ends in .png, .pdf or .svg")
@@ -415,7 +422,14 @@ def figure(
     return page
 
 
+def _result() -> type[Result]:
+    from lmdsl.result import Result
+
+    return Result
+
+
 def _view(result: Result, axes: Sequence[str] | None, at: At | None) -> View:
+    inputs.kind(result, _result(), "result", "a Result")
     return View.of(result.partition, result.cell_status == CellStatus.ATTRACTOR, axes, at)
 
 

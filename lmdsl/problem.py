@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 from pydantic.json_schema import GenerateJsonSchema
 
+from lmdsl import inputs
 from lmdsl.declarations import (
     Attractor,
     Avoid,
@@ -298,7 +298,7 @@ class Problem(Declared):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the problem file; it appears whole or not at all."""
-        write_whole(Path(path), self.to_json().encode())
+        write_whole(inputs.path(path), self.to_json().encode())
 
 
 def load(path: str | os.PathLike[str]) -> Problem:
@@ -315,7 +315,7 @@ def load(path: str | os.PathLike[str]) -> Problem:
         The file cannot be read, is no strict JSON, or declares no valid problem.
     """
     try:
-        data = read_json(Path(path))
+        data = read_json(inputs.path(path))
     except TypeError:
         raise BadInput(f"{shown(path)} is not a path") from None
     return parse_problem(data)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl import inputs
 from lmdsl.boxes import Area
 from lmdsl.certificate import Certificate
 from lmdsl.controller import ClosedLoop, Controller, Simulation, simulate
@@ -317,9 +318,11 @@ class Result(Report):
         """
         blocks = []
         for i, box in enumerate(boxes):
+            inputs.kind(box, Mapping, f"boxes[{i}]", "a box; write {axis: (a, b)}")
             for name in box:
                 if name not in self.partition.names:
                     raise BadInput(f"{shown(name)} is not an axis", f"boxes[{i}]")
+            box = {name: inputs.interval(ends, f"boxes[{i}].{name}") for name, ends in box.items()}
             blocks.append(self.partition.inside_box(box, f"boxes[{i}]"))
         weight = np.where(self.partition.mask(blocks), self.weight, 0.0)
         on = weight > 0
@@ -355,11 +358,8 @@ class Result(Report):
         BadInput
             There is no controller, or a count or the limit is not positive.
         """
-        for name, count in (("starts", starts), ("steps", steps), ("hold", hold)):
-            if not isinstance(count, int | np.integer) or count < 1:
-                raise BadInput(f"{shown(count)} is not a whole number >= 1", name)
-        if not isinstance(seed, int | np.integer) or seed < 0:
-            raise BadInput(f"{shown(seed)} is not a whole number >= 0", "seed")
+        starts, steps = inputs.whole(starts, "starts"), inputs.whole(steps, "steps")
+        hold, seed = inputs.whole(hold, "hold"), inputs.seed(seed)
         if (self.control_index < 0).all():
             raise BadInput("there is no controller to simulate: " + self.message)
         cells = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
@@ -372,14 +372,14 @@ class Result(Report):
         """Write the result as a directory that appears whole or not at all."""
         from lmdsl.archive import save
 
-        save(self, path)
+        save(self, inputs.path(path))
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Result:
         """Read a result directory. Nothing is re-verified; see :func:`lmdsl.verify`."""
         from lmdsl.archive import load
 
-        return load(path)
+        return load(inputs.path(path))
 
     def __repr__(self) -> str:
         parts = [f"status={self.status!r}", f"backend={self.backend!r}", f"gamma={self.gamma!r}"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import backends, bellman, certificate, feasibility, gamma, policy
+from lmdsl import backends, bellman, certificate, feasibility, gamma, inputs, policy
 from lmdsl.asking import ask
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.certificate import Certificate, Verified, Witness
@@ -189,12 +190,10 @@ def not_compiled(
 def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:
     if not isinstance(problem, Problem | StabilizationLP):
         raise BadInput(f"{shown(problem)} is neither a Problem nor a compiled LP", "problem")
-    if not _number(tolerance) or not 0 <= tolerance < np.inf:
+    if not _number(tolerance) or not 0 <= tolerance < 1e300:
         raise BadInput(f"{shown(tolerance)} must be a finite number >= 0", "tolerance")
-    if max_iterations is not None and not (
-        isinstance(max_iterations, int | np.integer) and max_iterations >= 1
-    ):
-        raise BadInput(f"{shown(max_iterations)} must be a whole number >= 1", "max_iterations")
+    if max_iterations is not None:
+        inputs.whole(max_iterations, "max_iterations", most=math.inf)
 
 
 def _number(value: Any) -> bool:

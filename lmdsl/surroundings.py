@@ -8,6 +8,8 @@ from typing import ParamSpec, TypeVar
 
 import numpy as np
 
+from lmdsl.errors import BadInput, shown
+
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
@@ -20,6 +22,9 @@ def own_arithmetic(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
+        progress = kwargs.get("progress")
+        if progress is not None and not callable(progress):
+            raise BadInput(f"{shown(progress)} is not a function", "progress")
         with np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"):
             return function(*args, **kwargs)
 

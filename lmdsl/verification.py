@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl import archive, memory
+from lmdsl import archive, inputs, memory
 from lmdsl.certificate import CLAIMS, Certificate, Witness, check
 from lmdsl.errors import BadInput
 from lmdsl.exact import check_exactly
@@ -102,6 +102,7 @@ def verify(
         The directory cannot be read.
     """
     judge = check_exactly if exact else check
+    path = inputs.path(path)
     result = archive.load(path)
     notes: list[str] = []
     lp = recompiled(path, result, progress)

@@ -255,9 +255,12 @@ def test_ctrl_c_ends_ipopt_and_the_solve():
 def test_ctrl_c_that_casadi_swallows_is_raised():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with pytest.raises(KeyboardInterrupt), ipopt_backend._interruptible():
-            with contextlib.suppress(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGINT)
+        with (
+            pytest.raises(KeyboardInterrupt),
+            ipopt_backend._interruptible(),
+            contextlib.suppress(KeyboardInterrupt),
+        ):
+            signal.raise_signal(signal.SIGINT)
         with ipopt_backend._interruptible():
             pass
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

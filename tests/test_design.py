@@ -16,7 +16,8 @@ PACKAGE = Path(lm.__file__).parent
 
 # Data flows one way: a module imports only from modules on an earlier line.
 ORDER = """
-errors frozen forking surroundings
+errors frozen forking
+surroundings inputs
 kernels
 files arrays quiet
 folder

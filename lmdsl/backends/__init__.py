@@ -113,6 +113,8 @@ def missing(backend: Backend) -> dict[str, str]:
 
     Nothing is imported; an installation that has the algorithm built in can still run it.
     """
+    if not isinstance(backend, Backend):
+        raise BadInput(f"{shown(backend)} is no Backend", "backend")
     found = {}
     for algorithm, distribution in backend.capabilities.extras.items():
         try:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lmdsl import inputs, memory
 from lmdsl.controller import draw_starts
 from lmdsl.errors import BadInput
 from lmdsl.graph import CellStatus
@@ -43,7 +44,7 @@ def control_vector(
         if set(control) != set(names):
             raise BadInput(f"name every control once: {', '.join(names)}", "control")
         control = [control[k] for k in names]
-    values = np.atleast_1d(np.asarray(control, dtype=np.float64))
+    values = np.atleast_1d(inputs.real(control, "control"))
     if values.shape != (len(names),) or not np.isfinite(values).all():
         raise BadInput(f"give {len(names)} finite numbers ({', '.join(names)})", "control")
     return dict(zip(names, map(float, values), strict=True))
@@ -86,7 +87,9 @@ def open_loop(
     With ``fine`` a step makes PIECES states.
     """
     image = constant_map(problem, fine)
-    points = np.full((steps * (PIECES if fine else 1) + 1, *x.shape), np.nan)
+    length = steps * (PIECES if fine else 1) + 1
+    memory.require(8 * length * x.size, "runs")
+    points = np.full((length, *x.shape), np.nan)
     points[0] = partition.states(x)
     active = np.arange(len(x))
     held = np.tile(list(u.values()), (len(x), 1))
@@ -104,12 +107,12 @@ def starts_of(result: Result, starts: int | ArrayLike, seed: int) -> Floats:
     """Return so many random starts, drawn by m, or the given ones, shape (r, d)."""
     d = result.partition.dimension
     if isinstance(starts, int | np.integer):
-        if starts < 1:
-            raise BadInput(f"{starts} is not a positive number", "starts")
+        starts = inputs.whole(starts, "starts")
+        memory.require(100 * starts * d, "runs")
         cells = np.flatnonzero(result.weight)
         rng = np.random.default_rng(seed)
         return draw_starts(result.partition, cells, result.weight[cells], int(starts), rng)
-    x = np.array(starts, dtype=np.float64)
+    x = inputs.states(starts, result.partition.names, "starts")
     if x.ndim != 2 or x.shape[1] != d or not len(x):
         raise BadInput(f"states have shape (r, {d}), not {x.shape}", "starts")
     return x

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl import inputs
 from lmdsl.errors import BadInput, shown
 from lmdsl.partition import Partition
 
@@ -59,7 +60,10 @@ class View:
         at: Mapping[str, float] | None = None,
     ) -> View:
         """Resolve a choice of axes; the default slice passes through the attractor's centre."""
-        names, at = partition.names, at or {}
+        names, at = partition.names, {} if at is None else at
+        inputs.kind(at, Mapping, "at", "a mapping; write {axis: value}")
+        if axes is not None:
+            inputs.kind(axes, list | tuple, "axes", "a list of axes")
         chosen = tuple(names[:2] if axes is None else axes)
         for name in (*chosen, *at):
             if name not in names:
@@ -75,7 +79,7 @@ class View:
         distance = np.abs((centres - centres.mean(axis=0)) / partition.width).sum(axis=1)
         point = centres[np.argmin(distance)].copy()
         for name, value in at.items():
-            point[names.index(name)] = value
+            point[names.index(name)] = inputs.states({name: value}, [name], "at")[..., 0]
         inside = partition.locate([np.array([x]) for x in point], clip=False)
         if inside[0] < 0:
             raise BadInput(f"{shown(dict(at))} lies outside the state box", "at")

@@ -9,11 +9,11 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lmdsl import inputs
 from lmdsl.errors import BadInput
 from lmdsl.files import write_whole
 from lmdsl.gamma import restricted
@@ -48,6 +48,7 @@ def export_certificate(
         The result has neither a controller nor a refusal that vectors prove, it is not about this
         model, or the file cannot be written.
     """
+    inputs.kind(result, Result, "result", "a Result")
     refused = result.status == "not_stabilizable"
     if refused and result.cause != "gamma":
         raise BadInput(
@@ -62,7 +63,7 @@ def export_certificate(
         raise BadInput("the result and the model have different cells")
     if not refused and (result.control_index[lp.cells] < 0).any():
         raise BadInput("there is no controller to export: " + result.message)
-    write_whole(Path(path), _lines(_head(result, lp, refused), result, lp, refused))
+    write_whole(inputs.path(path), _lines(_head(result, lp, refused), result, lp, refused))
 
 
 def _part(lp: StabilizationLP, result: Result) -> StabilizationLP:

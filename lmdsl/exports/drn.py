@@ -9,8 +9,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from fractions import Fraction
-from pathlib import Path
 
+from lmdsl import inputs
 from lmdsl.errors import BadInput
 from lmdsl.files import write_whole
 from lmdsl.lp import StabilizationLP
@@ -39,6 +39,7 @@ def export_drn(lp: StabilizationLP, path: str | os.PathLike[str]) -> None:
     BadInput
         Gamma is not 1, C is empty, no cell of C has m > 0, or the file cannot be written.
     """
+    inputs.kind(lp, StabilizationLP, "lp", "a compiled LP; see lmdsl.compile")
     if lp.gamma != 1:
         raise BadInput(
             f"{lp.gamma!r} is not accepted: Storm's expected total cost has no weight, so only a "
@@ -49,7 +50,7 @@ def export_drn(lp: StabilizationLP, path: str | os.PathLike[str]) -> None:
         raise BadInput("the stabilizable set is empty; there is no model to export")
     if not lp.weight.any():
         raise BadInput("no cell of `measure` is stabilizable; there is no initial state")
-    write_whole(Path(path), _lines(lp))
+    write_whole(inputs.path(path), _lines(lp))
 
 
 def _lines(lp: StabilizationLP) -> Iterator[bytes]:
