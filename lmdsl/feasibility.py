@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bellman, bounds, linear
+from lmdsl import bellman, bounds, growth, linear
 from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.policy import iterate, peeled, stability_vector
@@ -122,6 +122,11 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
         if w is not None:
             yield Feasible(better.pair, w)
             return
+    if g > 1:
+        decided = _decided(lp, stop)
+        yield decided
+        if not isinstance(decided, Undecided):
+            return
     unit = np.ones(lp.K)
     for horizon in (4.0 * level.max(), 64.0 * level.max()):
         at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
@@ -134,8 +139,7 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
                 return
             if done.converged:
                 break
-    refuse_at = 0
-    for step in range(200):
+    for _ in range(200):
         done = iterate(lp, pair, value, at, unit, stop=stop)
         pair, value = done.pair, done.value
         yield Undecided(pair, at)
@@ -145,12 +149,6 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
             return
         if stop():
             return
-        if g > 1 and at >= 1 and step >= refuse_at:
-            refuse_at = 2 * step + 4
-            proof = refusal(lp, stop)
-            if proof is not None:
-                yield Refused(proof, pair, at)
-                return
         # Raise gamma as far towards g as this policy allows, by bisection from above.
         reach, raised = g, None
         while raised is None and reach > at * (1 + 1e-13):
@@ -162,19 +160,31 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
         yield Undecided(pair, at)
 
 
-def refusal(lp: StabilizationLP, stop: Stop = never) -> Floats | None:
-    """Return w >= 0, w != 0 that should satisfy w <= gamma P_a w for every pair, or None.
+def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
+    """Decide a gamma > 1 by optimal stopping at gamma' just below gamma, or gamma itself.
 
-    w is the greatest solution of w = min(1, gamma' min_a P_a w) with gamma' just below gamma (the
-    slack absorbs rounding) or gamma itself. It is 0 exactly when gamma' < gamma_bar.
+    The greatest solution w of w = min(1, gamma' min_a P_a w) is 0 exactly when gamma' < gamma_bar.
+    Then the last policy is stabilizing at gamma', and as a rule at gamma too. Else w is the proof
+    against gamma; the slack absorbs rounding.
     """
+    best = growth.short_lived(lp, stop)
     for slack in (1e-6, 1e-9, 1e-12, 0.0):
-        found = optimal_stopping(lp, lp.gamma * (1 - slack), np.ones(lp.n), stop=stop)
+        if best.limit > lp.gamma:
+            w, _ = stability_vector(lp, best.pair, stop=stop)
+            if w is not None:
+                return Feasible(best.pair, w)
+        at = lp.gamma * (1 - slack)
+        going = best.rate * at < 1 - 1e-12
+        found = optimal_stopping(lp, at, np.ones(lp.n), best.pair, going, stop)
         if found is None:
-            return None
+            break
         if found.refuses:
-            return found.carried
-    return None
+            low, _ = growth.prove_low(lp, best) or (0.0, None)
+            return Refused(found.carried, best.pair, low)
+        if found.going.all():
+            better = growth.of_policy(lp, found.pair, stop)
+            best = better if better.limit > best.limit else best
+    return Undecided(best.pair, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

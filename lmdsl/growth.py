@@ -9,13 +9,14 @@ grow over hundreds of decades, costs one pass.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bounds, linear
+from lmdsl import bellman, bounds, linear
 from lmdsl.directions import Directions
 from lmdsl.forking import cached_property
 from lmdsl.kernels import kernel
@@ -37,6 +38,9 @@ SLOWER = 1e-3
 
 STEPS = 100
 """Steps of Noda's iteration, at most."""
+
+PASSES = 8
+"""Passes over all pairs towards a policy from which runs last least."""
 
 SMALLEST, LARGEST = 1e-280, 1e300
 """Range of w."""
@@ -70,7 +74,8 @@ class Growth:
     @property
     def limit(self) -> float:
         """1/rho(P_u): the policy is gamma-stabilizing below it."""
-        return 1 / float(self.rate.max())
+        rate = float(self.rate.max())
+        return 1 / rate if rate > 0 else math.inf
 
     @property
     def slowest(self) -> NDArray[np.bool_]:
@@ -98,6 +103,24 @@ def of_policy(lp: StabilizationLP, pair: Pairs, stop: Stop = never) -> Growth:
         x[cells], rate[cells], least = _perron(P[cells][:, cells], stop, slowest, directions)
         slowest = max(slowest, least)
     return Growth(pair, P, order, ends, x, rate)
+
+
+def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
+    """Return a policy that brings runs home within a few steps, as far as any does.
+
+    From the levels of Algorithm 1, w <- min_a P_a w weighs what has not arrived by then. Where the
+    policy that comes out is no better than the first one, that of the levels, it is that.
+    """
+    level, pair = lp._algorithm_1
+    first = of_policy(lp, pair, stop)
+    w, zero = level.astype(np.float64), np.zeros(lp.K)
+    for _ in range(PASSES):
+        if stop():
+            return first
+        done = bellman.improve(lp, w, 1.0, zero)
+        w, pair = done.value, done.pair
+    found = of_policy(lp, pair, stop)
+    return found if found.limit > first.limit else first
 
 
 def _perron(

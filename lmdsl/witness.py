@@ -34,6 +34,9 @@ Pairs = NDArray[np.int64]
 
 MOST_GUESSED = 1e-7
 
+LEAST_PASSES, MOST_PASSES, MOST_READ = 100, 2000, 2 * 10**8
+"""Passes from 0 towards the lower bound, and how many transitions they may read in all."""
+
 RELATIVE_SLACK = (1e-13, 1e-11, 1e-9)
 """Near gamma_bar an absolute slack drowns in the rounding of large values. The value at
 gamma (1 + s) leaves a slack s gamma P V relative to V above; the optimum at gamma (1 - s) below."""
@@ -102,8 +105,9 @@ def _tightened(
     lp: StabilizationLP, witness: Witness, V: Floats, tolerance: float, stop: Stop
 ) -> Witness:
     """Bring the bounds of the cost together, where the first try did not."""
-    pair, V_up, W = witness.pair, witness.V_up, lower_vector(lp, V, tolerance, stop)
+    pair, V_up, W = witness.pair, witness.V_up, _scaled(lp, V)
     assert pair is not None
+    W = np.zeros(lp.n) if W is None else W
     best = gap(lp, V_up, W)
     for slack in RELATIVE_SLACK:
         if best <= tolerance:
@@ -114,6 +118,8 @@ def _tightened(
         except Stopped:
             break
         best = gap(lp, V_up, W)
+    if best > tolerance and not stop():
+        W = _greater(lp, W, lower_vector(lp, V, tolerance, stop))
     return replace(witness, V_up=V_up, W=W)
 
 
@@ -179,7 +185,8 @@ def lower_vector(
         if W is not None:
             candidates.append(W)
     if V is None or not candidates or gap(lp, V, candidates[0]) > tolerance:
-        candidates.append(bounds.raise_from_zero(lp, lp.gamma, lp.cost, 2000, stop))
+        passes = max(LEAST_PASSES, min(MOST_PASSES, MOST_READ // max(len(lp.rows.target), 1)))
+        candidates.append(bounds.raise_from_zero(lp, lp.gamma, lp.cost, passes, stop))
     good = [W for W in candidates if check_lower(lp, W)]
     best: Floats = max(good, key=lambda W: weighted(lp, W), default=zero)
     return best

@@ -9,13 +9,16 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from models import brute_force, build, dense, mdp, random_lp
 from problems import doubling, made, standard_map, steps
+from scipy.sparse.linalg import eigs
 
 import lmdsl as lm
-from lmdsl import gamma
+from lmdsl import gamma, growth, linear
 from lmdsl.bounds import exactly_below
 from lmdsl.cli import main
+from lmdsl.directions import Directions
 from lmdsl.gamma import check_high
 from lmdsl.growth import check_low
 from lmdsl.rows import Rows, Shares
@@ -154,6 +157,51 @@ def _check_vectors(lp, found):
         row = lp.rows.exact(int(k))
         ahead = sum(w[j] * s for j, s in row if j < lp.n) / lp.rows.shares.total
         assert Fraction(found.low) * ahead <= w[i]
+
+
+@pytest.mark.parametrize("width", [1e-8, 1e-2, 0.5])
+def test_the_width_asked_for(width):
+    for made_lp in (chain([9, 5]), lm.compile(made(standard_map(20)))):
+        found = lm.gamma_max(made_lp, width=width)
+        assert found.high <= found.low * (1 + width)
+        assert found.note == ""
+        exact = gamma.bracket(made_lp)
+        assert found.low <= exact.high
+        assert found.high >= exact.low
+        _check_vectors(made_lp, found)
+
+
+@pytest.mark.parametrize("width", [0, -1.0, 1e-9, 2, np.nan, "1", True, None])
+def test_a_width_that_is_none(width):
+    with pytest.raises(lm.BadInput, match="width"):
+        lm.gamma_max(made(doubling()), width=width)
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.3])
+def test_the_rate_of_a_large_class_needs_no_factors(shift, monkeypatch):
+    """A walk with jumps: 1,500 cells in one class, which sparse factors would fill."""
+    rng = np.random.default_rng(3)
+    n = linear.KRYLOV + 500
+    target = np.concatenate([(np.arange(n) + 1) % n, rng.integers(0, n, 3 * n)])
+    weight = rng.random(4 * n) + shift
+    M = sp.csr_array((weight, (np.tile(np.arange(n), 4), target)), (n, n))
+    M = sp.csr_array(M / (1.1 * M.sum(axis=1).max()))
+    monkeypatch.setattr(linear, "solve_by_class", None)
+    x, rate, least = growth._perron(M, linear.never, 0.0, Directions.line(n))
+    assert (x > 0).all()
+    assert least <= rate <= least * (1 + 1e-9)
+    assert rate == pytest.approx(abs(eigs(M, k=1, return_eigenvectors=False)[0]), rel=1e-9)
+    early = growth._perron(M, linear.never, 2 * rate, Directions.line(n))
+    assert rate < early[1] < 2 * rate
+
+
+@pytest.mark.parametrize(("cells", "g"), [(30, 2.2), (50, 2.4), (50, 2.5001), (50, 5), (50, 1e6)])
+def test_gamma_near_and_far_beyond_its_limit(cells, g):
+    result = lm.solve(made(standard_map(cells, gamma=g)))
+    limits = gamma.bracket(lm.compile(made(standard_map(cells))))
+    assert not limits.low <= g <= limits.high
+    expected = "verified" if g < limits.low else "not_stabilizable"
+    assert result.status == expected, result.message
 
 
 def test_doubling_map():

@@ -11,6 +11,8 @@ def add(command: Command) -> None:
     limit = command("gamma-max", _gamma_max, "Enclose the largest feasible gamma.")
     limit.add_argument("file", metavar="FILE", help="problem file")
     limit.add_argument("--time-limit", type=float, metavar="S", help="seconds")
+    limit.add_argument("--width", type=float, default=1e-6, metavar="W",
+                       help="relative width asked for, 1e-8 to 1 (1e-6)")  # fmt: skip
     as_json(limit)
 
     explain = command("explain", _explain, "Say which cells cannot be stabilized, why, and what "
@@ -28,7 +30,7 @@ def _gamma_max(parsed: Arguments) -> int:
 
     problem = load(parsed.file)
     with Progress() as progress:
-        found = gamma_max(problem, progress, parsed.time_limit)
+        found = gamma_max(problem, progress, parsed.time_limit, parsed.width)
     if parsed.json:
         print_json(found.to_dict())
     else:
