@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -149,10 +150,12 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
             return
         if stop():
             return
-        # Raise gamma as far towards g as this policy allows, by bisection from above.
+        # Raise gamma as far towards g as this policy allows, by bisection from above (of exponents,
+        # as long as g is out of sight).
         reach, raised = g, None
         while raised is None and reach > at * (1 + 1e-13):
-            reach = at + (reach - at) / 2
+            far = reach > 4 * at
+            reach = math.sqrt(at) * math.sqrt(reach) if far else at + (reach - at) / 2
             raised, _ = stability_vector(lp, pair, g=reach, stop=stop)
         if raised is None:
             return

@@ -320,7 +320,7 @@ def _beyond(
     Neither where doubles do not decide. The first stopping policy goes on wherever the class of
     ``start`` does not grow.
     """
-    going = start.rate * gamma < 1 - 1e-12
+    going = start.rate < (1 - 1e-12) / gamma  # gamma may be infinite
     found = feasibility.optimal_stopping(lp, gamma, np.ones(lp.n), start.pair, going, stop)
     if found is None:
         return None

@@ -10,6 +10,7 @@ grow over hundreds of decades, costs one pass.
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -213,8 +214,8 @@ def check_low(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
     if not (np.isfinite(w).all() and (w > 0).all()):
         return None
     ahead = bounds.expected_above(lp, pair, w, 1.0)
-    with np.errstate(divide="ignore"):
-        ratio = w / ahead
+    with np.errstate(divide="ignore", over="ignore"):
+        ratio = np.where(ahead > 0, np.minimum(w / ahead, sys.float_info.max), np.inf)
     return float(ratio.min()) * (1 - 4 * bounds.UNIT)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import inputs
+from lmdsl import inputs, sums
 from lmdsl.boxes import Area
 from lmdsl.certificate import Certificate
 from lmdsl.controller import ClosedLoop, Controller, Simulation, simulate
@@ -325,13 +325,10 @@ class Result(Report):
             box = {name: inputs.interval(ends, f"boxes[{i}].{name}") for name, ends in box.items()}
             blocks.append(self.partition.inside_box(box, f"boxes[{i}]"))
         weight = np.where(self.partition.mask(blocks), self.weight, 0.0)
-        on = weight > 0
-        if not on.any():
+        if not weight.any():
             raise BadInput("no cell of C inside the boxes carries weight; enlarge them", "boxes")
-        mass = math.fsum(weight)
-        with np.errstate(invalid="ignore"):
-            upper, lower = (math.fsum(weight[on] * x[on]) / mass for x in (self.value, self.lower))
-        return CostFrom(upper * (1 + 1e-15), lower * (1 - 1e-15), mass)
+        upper = sums.mean(weight, self.value, math.inf)
+        return CostFrom(upper, sums.mean(weight, self.lower, -math.inf), math.fsum(weight))
 
     @own_arithmetic
     def simulate(

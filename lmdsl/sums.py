@@ -75,9 +75,10 @@ def weighted(weight: Floats, values: Floats, direction: float) -> float:
     if few and _within(weight) and _within(values):
         return _split(weight, values, direction)
     if not few and values.max() <= 2.0**1000:
-        product = weight * values
-        near = float(product.sum())
-        if near >= 2.0**-900:
+        with np.errstate(over="ignore"):
+            product = weight * values
+            near = float(product.sum())
+        if 2.0**-900 <= near <= 2.0**1000:
             # NumPy adds pairwise: fewer than 64 roundings deep, one more for each product.
             slack = 70 * UNIT * near + len(product) * LEAST
             return float(np.nextafter(near + math.copysign(slack, direction), direction))
@@ -93,6 +94,22 @@ def gap_above(weight: Floats, V: Floats, W: Floats) -> float:
         return float(np.nextafter(width / cost * (1 + 8 * UNIT), math.inf)) if width else 0.0
     exact = exactly(weight, V)
     return max(rounded_up((exact - exactly(weight, W)) / exact), 0.0) if exact else 0.0
+
+
+def mean(weight: Floats, values: Floats, direction: float) -> float:
+    """Return weight'values / sum of weights, rounded towards ``direction``; infinite with a value.
+
+    The weights are not all 0.
+    """
+    on = weight > 0
+    m, x = weight[on], values[on]
+    if not np.isfinite(x).all():
+        return math.inf
+    near = weighted(m, x, direction)
+    if 2.0**-900 <= near <= 2.0**1000 and m.min() >= 2.0**-900:
+        return near / math.fsum(m) * (1 + math.copysign(8 * UNIT, direction))
+    value = exactly(m, x) / sum(map(Fraction, m.tolist()))
+    return rounded_up(value) if direction > 0 else rounded_down(value)
 
 
 def stated_gap(gap: float, cost: float, lower: float) -> float:

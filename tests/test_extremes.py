@@ -20,7 +20,7 @@ from problems import made
 from test_properties import truly
 
 import lmdsl as lm
-from lmdsl import sums
+from lmdsl import feasibility, graph, growth, sums
 from lmdsl.certificate import CLAIMS, Witness, check
 from lmdsl.exact import check_exactly
 from lmdsl.rows import Rows, Shares
@@ -305,13 +305,92 @@ def tried(seeds):
 
 
 def test_no_check_says_yes_where_fractions_say_no():
-    count = tried(range(1000))
+    count = tried(range(700))
     assert min(count.values()) > 3, count
 
 
 @pytest.mark.long
 def test_no_check_says_yes_at_length():
     tried(range(10_000, 26_000))
+
+
+# What makes the witnesses -------------------------------------------------------------------
+
+
+def stabilizable(seed):
+    """Return a random model of such numbers, None where it is not all stabilizable."""
+    model = Model(np.random.default_rng(seed))
+    found = graph.stabilizable(model.lp.pair_pointer, model.lp.rows)
+    return model if found.inside.all() and found.surviving.all() else None
+
+
+def made_witness(seed):
+    """Solve a model; what is verified is true, the rest says why not."""
+    model = stabilizable(seed)
+    if model is None:
+        return None
+    lp = model.lp
+    result = lm.solve(lp)
+    json.dumps(result.to_dict(), allow_nan=False)
+    if result.verified:
+        on = lp.cells
+        pair = np.array([lp.column(k, result.control_index[k]) for k in on])
+        witness = Witness(pair, *(x[on] for x in vectors_of(result)))
+        choice = (pair - lp.pair_pointer[:-1]).tolist()
+        truth = truly(model.model, model.gamma, lp.weight, choice, witness, 1)
+        assert all(truth.values()), (seed, truth)
+    else:
+        assert result.message
+    return result.status
+
+
+def vectors_of(result):
+    return result.witness, result.value, result.lower, result.measure
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_solving_ends_without_a_false_word():
+    met = [made_witness(seed) for seed in range(60)]
+    assert met.count("verified") > 10, met
+    assert met.count("not_stabilizable") > 2, met
+
+
+@pytest.mark.long
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_solving_ends_at_length():
+    for seed in range(100, 1100):
+        made_witness(seed)
+
+
+def test_a_gamma_out_of_sight_is_decided_soon(monkeypatch):
+    """From 1 up to 1e300 by exponents: bisection of the numbers took a thousand proofs a policy."""
+    asked = []
+    proof = feasibility.stability_vector
+
+    def counted(*args, **more):
+        asked.append(1)
+        return proof(*args, **more)
+
+    monkeypatch.setattr(feasibility, "stability_vector", counted)
+    for gamma in (1e17, 1e300, LARGEST):
+        for model in filter(None, map(stabilizable, range(40))):
+            before = len(asked)
+            feasibility.stabilizing(replace(model.lp, gamma=gamma))
+            assert len(asked) - before < 2000
+    assert len(asked) > 100
+
+
+def test_a_limit_beyond_the_doubles_is_not_called_infinite():
+    """One cell stays with probability about 5e-324: its limit is above the largest double."""
+    weights = np.array([1.0, 5e-324])
+    shares = Shares.of(1, Nodes(np.zeros((2, 1)), weights, np.arange(2)))
+    rows = Rows(np.array([0, 2]), np.array([1, 0], np.int32), np.array([0, 1], np.uint8), shares, 1)
+    lp = build(np.array([0, 1]), np.zeros(1, np.int32), rows, np.ones(1), 1.0)
+    low = growth.check_low(lp, np.array([0]), np.ones(1))
+    assert low == pytest.approx(LARGEST)
+    assert low < np.inf
+    free = replace(lp, rows=replace(rows, target=np.array([1, 1], np.int32)))
+    assert growth.check_low(free, np.array([0]), np.ones(1)) == np.inf
 
 
 # From end to end ----------------------------------------------------------------------------
@@ -388,6 +467,24 @@ def test_the_smallest_cost_is_not_reported_as_nothing():
     result = lm.solve(made(one_axis(2, "0.5", False, "5e-324")))
     assert (result.cost, result.lower_bound, result.gap) == (5e-324, 5e-324, 0.0)
     assert result.verified
+
+
+@pytest.mark.parametrize("n", [3, 1_500])
+def test_conditional_costs_are_outward(n):
+    rng = np.random.default_rng(n)
+    for _ in range(30):
+        m, x = (np.resize(numbers(rng, 7, 0.3), n) for _ in range(2))
+        if not 0 < m.max() < 1e300:
+            continue
+        pairs = list(zip(m.tolist(), x.tolist(), strict=True))
+        exact = sum(Fraction(a) * Fraction(b) for a, b in pairs) / sum(
+            Fraction(a) for a, _ in pairs
+        )
+        up, down = sums.mean(m, x, np.inf), sums.mean(m, x, -np.inf)
+        assert Fraction(down) <= exact <= Fraction(min(up, LARGEST))
+        assert up <= down * (1 + 1e-12) + 1e-323
+    result = lm.solve(made(one_axis(3, "0.5", False, "5e-324")))
+    assert result.cost_from({"x": (1, 3)}) == lm.result.CostFrom(5e-324, 5e-324, 1.0)
 
 
 def test_a_cost_beyond_the_doubles_is_no_bound():

@@ -39,7 +39,7 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     except Stopped:
         return Solution(Stop.TIME_LIMIT, "time_limit", pair=pair)
     if value is None:
-        return Solution(Stop.FAILED, "the first policy has no finite value")
+        return Solution(Stop.FAILED, "some cell costs more than 1e305; divide stage_cost")
     done = policy.iterate(lp, pair, value, stop=late, limit=options.max_iterations)
     stop = Stop.OPTIMAL
     if not done.converged:
