@@ -118,7 +118,7 @@ def test_what_no_result_needs_is_not_computed():
     data["state_box"] = dict(zip("xv", data["state_box"].values(), strict=True))
     data["attractor"], data["stage_cost"] = {"points": [{"x": 0, "v": 0}]}, "1"
     problem = lm.Problem.model_validate(data)
-    program = sampled(problem)[0].step
+    program = sampled(problem)[0].step.func  # a partial call, with the deadline
     read = {k for step in program.instructions for k in step.operands} | set(program.outputs)
     assert all(step.target in read for step in program.instructions)
     assert len(program.instructions) < len(program.operations)
