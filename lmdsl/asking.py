@@ -21,6 +21,7 @@ from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput, MissingDependency, plain_text
 from lmdsl.frozen import freeze
 from lmdsl.lp import StabilizationLP
+from lmdsl.surroundings import restore_rounding
 
 Pairs = NDArray[np.int64]
 
@@ -67,7 +68,10 @@ def _ask(
             if backend.capabilities.elimination and options.start is not None:
                 kept, options = _without_suboptimal(lp, options)
                 asked = lp if len(kept) == lp.K else lp.part(kept, np.arange(lp.n))
-            found = backend.solve(*((asked, options) if own else _copies(asked, options)))
+            try:
+                found = backend.solve(*((asked, options) if own else _copies(asked, options)))
+            finally:
+                restore_rounding("the backend")
             solution = _plain(asked, found)
             iteration = found.details.get("iteration") if own else None
     except BadInput as refusal:

@@ -1,14 +1,16 @@
-"""What the caller's settings of NumPy must not change: whether and how lmdsl computes."""
+"""What callers and solvers must not change: whether and how lmdsl computes."""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
 import numpy as np
 
-from lmdsl.errors import BadInput, shown
+from lmdsl.errors import BadInput, LmdslError, shown
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -29,3 +31,27 @@ def own_arithmetic(function: Callable[_P, _R]) -> Callable[_P, _R]:
             return function(*args, **kwargs)
 
     return run
+
+
+def restore_rounding(who: str) -> None:
+    """Let the processor round to nearest, and keep tiny numbers, again.
+
+    Libraries built for speed set it to lose denormal numbers when they are loaded, others to round
+    in one direction; no bound would hold then.
+
+    Raises
+    ------
+    LmdslError
+        It cannot be restored.
+    """
+    if _rounds_to_nearest():
+        return
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL("libm.so.6").fesetenv(ctypes.c_void_p(-1))  # FE_DFL_ENV of Linux
+    if not _rounds_to_nearest():
+        raise LmdslError(f"{who} changed how this processor rounds; nothing can be proved now")
+
+
+def _rounds_to_nearest(one: float = 1.0, half: float = 2.0**-53, least: float = 5e-324) -> bool:
+    up, even, down = one + 1.5 * half, one + half, -one - half
+    return up == 1 + 2.0**-52 and even == 1.0 and down == -1.0 and one * least > 0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -16,7 +18,7 @@ import pytest
 from problems import made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl import policy
+from lmdsl import policy, surroundings
 from lmdsl.asking import ask
 from lmdsl.backends import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.cli import main
@@ -438,6 +440,40 @@ def test_numpys_settings_are_restored(lp, truth):
     assert np.geterr() == before
 
 
+@pytest.mark.skipif(
+    not (sys.platform == "linux" and platform.machine() == "x86_64"), reason="codes of x86-64 Linux"
+)
+@pytest.mark.parametrize("mode", [0x400, 0x800, 0xC00, "denormals"])
+def test_rounding_is_restored(lp, truth, mode):
+    libm = ctypes.CDLL("libm.so.6")
+
+    def sets(lp, options):
+        if mode == "denormals":
+            state = (ctypes.c_uint32 * 8)()
+            libm.fegetenv(state)
+            state[7] |= 0x8040  # flush to zero, denormals are zero
+            libm.fesetenv(state)
+        else:
+            libm.fesetround(mode)
+        assert not surroundings._rounds_to_nearest()
+        return optimal(lp, value=np.ones(lp.n))
+
+    try:
+        assert lm.solve(lp, foreign(sets)).cost == pytest.approx(truth.cost, rel=1e-9)
+        assert surroundings._rounds_to_nearest()
+        sets(lp, None)
+        surroundings.restore_rounding("the test")
+        assert surroundings._rounds_to_nearest()
+    finally:
+        libm.fesetenv(ctypes.c_void_p(-1))
+
+
+def test_rounding_that_cannot_be_restored_is_said(monkeypatch):
+    monkeypatch.setattr(surroundings, "_rounds_to_nearest", lambda: False)
+    with pytest.raises(lm.LmdslError, match="the backend changed how this processor rounds"):
+        surroundings.restore_rounding("the backend")
+
+
 # Packages that offer backends ----------------------------------------------------------------
 
 BROKEN = {
@@ -520,6 +556,14 @@ def test_what_is_broken_is_said_with_the_package(installed, name):
     assert str(refused.value).isprintable()
     if name != "inside":
         assert "broken" in str(refused.value)
+
+
+def test_an_extra_that_is_missing_is_named(monkeypatch, lp):
+    monkeypatch.setattr(lm.backends, "_found", lambda package: package != "casadi")
+    assert "ipopt" not in lm.backends.installed()
+    assert "ipopt" in lm.backends.names()
+    with pytest.raises(lm.BadInput, match="ipopt needs the package casadi"):
+        lm.solve(lp, "ipopt")
 
 
 @pytest.mark.parametrize("spec", [None, 7, b"highs", ["highs"], "", ":", "highs:", "\x1b[2J"])

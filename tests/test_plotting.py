@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -183,7 +184,7 @@ def test_measure_is_logarithmic_and_its_zeros_are_lowest(solved):
     measure = result.measure.copy()
     inside = np.flatnonzero(result.cell_status == 1)
     measure[inside[0]], measure[inside[1]], measure[inside[2]] = 0.0, 1e-5, 1e3
-    spoiled = SimpleNamespace(**{**vars(result), "measure": measure})
+    spoiled = replace(result, measure=measure)
     ax = plotting.measure(spoiled)
     (picture,) = ax.images
     assert type(picture.norm).__name__ == "LogNorm"
