@@ -1,9 +1,10 @@
 """Interval arithmetic on arrays: every operation encloses what its operands can produce.
 
-Sums, products and quotients of doubles are correctly rounded, so one step of ``nextafter`` makes
-a bound safe; elementary functions are trusted to FUNCTION_ULPS units in the last place (NumPy
-documents less than 4). An operation that may be undefined somewhere on its operands (a logarithm
-of a negative number, a quotient across zero) returns the whole line: nothing is then claimed.
+That is both the real results and the doubles computed. Sums, products and quotients of doubles are
+correctly rounded, so a unit in the last place makes a bound safe; an elementary function is trusted
+to FUNCTION_ULPS of them (NumPy documents less than 4), once at the end of the interval and once at
+the value. An operation that may be undefined somewhere on its operands (a logarithm of a negative
+number, a quotient across zero) returns the whole line: nothing is then claimed.
 """
 
 from __future__ import annotations
@@ -17,7 +18,17 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-FUNCTION_ULPS: Final = 8
+ROUNDING: Final = 2.0**-53
+"""Relative error of a correctly rounded operation."""
+
+FUNCTION_ULPS: Final = 4
+"""Error of a computed elementary function, in units of the last place of its value."""
+
+TINY: Final = 2.0**-1070
+"""More than a few operations lose to underflow."""
+
+_FUNCTION: Final = (4 * FUNCTION_ULPS + 2) * ROUNDING  # a unit is at most 2 ROUNDING of the value
+_TOP: Final = 1.0 + _FUNCTION  # so far a computed sine may go
 _LARGE: Final = 1e8  # beyond it, where in its period an argument lies is not worth finding out
 
 
@@ -44,12 +55,31 @@ def whole(like: Any) -> Interval:
     return Interval(np.full(np.shape(like), -np.inf), np.full(np.shape(like), np.inf))
 
 
-def outward(low: Any, high: Any, steps: int = 1) -> Interval:
-    """Widen by a number of units in the last place; what is not a number becomes the line."""
+def outward(low: Any, high: Any) -> Interval:
+    """Widen by a unit in the last place or two; what is not a number becomes the line."""
+    return _widened(low, high, 2 * ROUNDING, 5e-324)
+
+
+def loosened(low: Any, high: Any) -> Interval:
+    """Widen the computed values of an elementary function; see the module."""
+    return _widened(low, high, _FUNCTION, TINY)
+
+
+def _widened(low: Any, high: Any, share: float, least: float) -> Interval:
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-    for _ in range(steps):
-        low, high = np.nextafter(low, -np.inf), np.nextafter(high, np.inf)
+    low, high = low - (np.abs(low) * share + least), high + (np.abs(high) * share + least)
     return Interval(np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high))
+
+
+def magnitude(a: Interval) -> Any:
+    """Return the largest |x| of an interval."""
+    return np.maximum(np.abs(a.low), np.abs(a.high))
+
+
+def mignitude(a: Interval) -> Any:
+    """Return the least |x| of an interval."""
+    across = (a.low <= 0) & (a.high >= 0)
+    return np.where(across, 0.0, np.minimum(np.abs(a.low), np.abs(a.high)))
 
 
 def either(condition: Any, a: Interval, b: Interval) -> Interval:
@@ -84,9 +114,10 @@ def negative(a: Interval) -> Interval:
 
 def multiply(a: Interval, b: Interval) -> Interval:
     """Return a b, with 0 times infinity = 0: an end at infinity is a bound, not a value."""
-    products = [np.asarray(x * y) for x in a for y in b]
-    for p in products:
-        p[np.isnan(p)] = 0.0
+    left, right = (x[:1] if x.low is x.high else x for x in (a, b))  # points have one end
+    products = [np.asarray(x * y) for x in left for y in right]
+    if any(np.isnan(p).any() for p in products):
+        products = [np.where(np.isnan(p), 0.0, p) for p in products]
     low, high = products[0], products[0]
     for p in products[1:]:
         low, high = np.minimum(low, p), np.maximum(high, p)
@@ -95,16 +126,14 @@ def multiply(a: Interval, b: Interval) -> Interval:
 
 def square(a: Interval) -> Interval:
     """Return a^2, which is never negative."""
-    return even(a, np.square, 1)
+    return even(a, np.square, outward)
 
 
-def even(a: Interval, function: Callable[[Any], Any], steps: int) -> Interval:
-    """Return f(a) of an even function that grows with |a|."""
-    far = np.maximum(np.abs(a.low), np.abs(a.high))
-    across = (a.low <= 0) & (a.high >= 0)
-    near = np.where(across, 0.0, np.minimum(np.abs(a.low), np.abs(a.high)))
-    value = outward(function(near), function(far), steps)
-    return Interval(np.where(across, function(0.0), np.maximum(value.low, 0.0)), value.high)
+def even(a: Interval, function: Callable[[Any], Any], widen: Callable[..., Interval]) -> Interval:
+    """Return f(a) of an even function that grows with |a| from f(0) >= 0."""
+    near, far = function(mignitude(a)), function(magnitude(a))
+    value = widen(near, far)
+    return Interval(np.maximum(value.low, 0.0), value.high)
 
 
 def divide(a: Interval, b: Interval) -> Interval:
@@ -122,7 +151,7 @@ def increasing(
 
     def extension(a: Interval) -> Interval:
         inside = (a.low >= low) & (a.high <= high)
-        value = outward(function(a.low), function(a.high), FUNCTION_ULPS)
+        value = loosened(function(a.low), function(a.high))
         return either(inside, value, whole(value.low))
 
     return extension
@@ -135,9 +164,9 @@ def exactly(function: Callable[[Any], Any]) -> Callable[[Interval], Interval]:
 
 def _turns(a: Interval, offset: float, period: float) -> Any:
     """Return whether an interval may hold offset + k period for a whole k; errs towards yes."""
-    slack = 1e-12 * (1 + np.maximum(np.abs(a.low), np.abs(a.high)))
+    slack = 1e-12 * (1 + magnitude(a))
     first, last = (a.low - slack - offset) / period, (a.high + slack - offset) / period
-    far = ~(np.maximum(np.abs(a.low), np.abs(a.high)) <= _LARGE)
+    far = ~(magnitude(a) <= _LARGE)
     return (np.floor(last) >= np.ceil(first)) | far
 
 
@@ -153,21 +182,21 @@ def cosine(a: Interval) -> Interval:
 
 def _wave(a: Interval, function: Callable[[Any], Any], top: float) -> Interval:
     ends = function(a.low), function(a.high)
-    value = outward(np.minimum(*ends), np.maximum(*ends), FUNCTION_ULPS)
-    low = np.where(_turns(a, top - math.pi, 2 * math.pi), -1.0, value.low)
-    high = np.where(_turns(a, top, 2 * math.pi), 1.0, value.high)
-    return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0))
+    value = loosened(np.minimum(*ends), np.maximum(*ends))
+    low = np.where(_turns(a, top - math.pi, 2 * math.pi), -_TOP, value.low)
+    high = np.where(_turns(a, top, 2 * math.pi), _TOP, value.high)
+    return Interval(np.maximum(low, -_TOP), np.minimum(high, _TOP))
 
 
 def tangent(a: Interval) -> Interval:
     """Return tan(a); the whole line where a pole may lie inside."""
-    value = outward(np.tan(a.low), np.tan(a.high), FUNCTION_ULPS)
+    value = loosened(np.tan(a.low), np.tan(a.high))
     return either(_turns(a, math.pi / 2, math.pi), whole(value.low), value)
 
 
 def absolute(a: Interval) -> Interval:
     """Return |a|."""
-    return even(a, np.abs, 0)
+    return Interval(mignitude(a), magnitude(a))
 
 
 def power(a: Interval, exponent: float) -> Interval:
@@ -176,8 +205,8 @@ def power(a: Interval, exponent: float) -> Interval:
     if exponent < 0:
         return divide(Interval.point(1.0), power(a, -exponent))
     if whole_number and exponent % 2 == 0:
-        return even(a, lambda x: np.power(x, exponent), FUNCTION_ULPS)
-    value = outward(np.power(a.low, exponent), np.power(a.high, exponent), FUNCTION_ULPS)
+        return even(a, lambda x: np.power(x, exponent), loosened)
+    value = loosened(np.power(a.low, exponent), np.power(a.high, exponent))
     return value if whole_number else either(a.low >= 0, value, whole(value.low))
 
 
@@ -188,6 +217,6 @@ def angle(y: Interval, x: Interval) -> Interval:
     for c in corners[1:]:
         low, high = np.minimum(low, c), np.maximum(high, c)
     cut = (x.low <= 0) & (y.low <= 0) & (y.high >= 0)
-    value = outward(low, high, FUNCTION_ULPS)
-    turn = outward(np.full(np.shape(low), -math.pi), np.full(np.shape(low), math.pi))
+    value = loosened(low, high)
+    turn = loosened(np.full(np.shape(low), -math.pi), np.full(np.shape(low), math.pi))
     return either(cut, turn, value)

@@ -9,6 +9,7 @@ of the control grid. Together they are the paper's feedback: C0 near the attract
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +31,10 @@ Indices = NDArray[np.int64]
 
 MAX_RICCATI = 256  # states of the Riccati equation: orbit points times axes
 ON_ORBIT = 1e-3  # cell widths by which a point may miss its successor
+
+
+def _on_arrays(operation: str, *operands: Any) -> Any:
+    return {"rint": np.rint, "min": np.minimum, "max": np.maximum}[operation](*operands)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +134,8 @@ class LocalController(Frozen):
         if len(self.orbit) == 1:
             return np.zeros(len(cell), dtype=np.int64)
         away = self.deviation(self.partition.centres(cell)[:, None, :], self.orbit[None, :, :])
-        nearest: Indices = np.argmin(((away / self.partition.width) ** 2).sum(axis=-1), axis=-1)
+        far = sum((away[..., i] / h) ** 2 for i, h in enumerate(self.partition.width))
+        nearest: Indices = np.argmin(far, axis=-1)
         return nearest
 
     def deviation(self, x: Floats, point: Floats) -> Floats:
@@ -141,12 +147,37 @@ class LocalController(Frozen):
 
     def __call__(self, x: Floats, cell: Indices) -> Floats:
         """Return the control at states x, shape (r, d), of given attractor cells, shape (r, p)."""
+        u = self.law(list(x.T), cell)
+        return np.stack(u, axis=-1) if u else np.zeros((len(x), 0))
+
+    def law(
+        self, x: Sequence[Any], cell: Indices, apply: Callable[..., Any] = _on_arrays
+    ) -> list[Any]:
+        """Return the controls at states given by axis, arrays or anything else with arithmetic.
+
+        ``apply(name, *operands)`` does the operations ``rint``, ``min`` and ``max``. The order of
+        all operations is fixed, so that an enclosure of them holds for what is computed.
+        """
         k = self.owner(cell)
         # By way of the cell's centre: on a circle the law then has no jump inside a cell.
         centre = self.partition.centres(cell)
-        away = self.deviation(x, centre) + self.deviation(centre, self.orbit[k])
-        u = self.control[k] - np.einsum("rpd,rd->rp", self.gain[k], away)
-        return np.asarray(np.clip(u, self.low, self.high))
+        origin = self.deviation(centre, self.orbit[k])
+        away = []
+        for i, axis in enumerate(self.partition.axes):
+            by = x[i] - centre[:, i]
+            if axis.periodic:
+                span = axis.high - axis.low
+                by = by - apply("rint", by / span) * span
+            away.append(by + origin[:, i])
+        controls = []
+        for j in range(self.gain.shape[1]):
+            u: Any = self.control[k, j]
+            for i, by in enumerate(away):
+                if self.gain[:, j, i].any():
+                    u = u - self.gain[k, j, i] * by
+            u = apply("max", u, self.low[j])
+            controls.append(apply("min", u, self.high[j]))
+        return controls
 
     def distance(self, x: Floats) -> Floats:
         """Return the distance from the orbit in cell widths (largest axis), shape (r,)."""

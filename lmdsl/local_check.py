@@ -1,7 +1,8 @@
 """Whether the local controller keeps the attractor cells: by samples, and by enclosure.
 
-To prove T(x, C0(x), w) in A for every x of a cell, the cell is cut into boxes until the enclosed
-image of each (jets.py) meets attractor cells only.
+To prove T(x, C0(x), w) in A for every x of a cell, its domain (every state that is located in it)
+is cut into boxes until the enclosed image of each (jets.py) meets attractor cells only. This is
+proved of the map as computed, with its rounding, and so of what a simulation can do.
 """
 
 from __future__ import annotations
@@ -13,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.axis import EDGE
 from lmdsl.deadline import Deadline, TimeLimitReached
-from lmdsl.intervals import Interval, add, intersection, multiply, subtract
-from lmdsl.jets import Jet, apply
+from lmdsl.intervals import Interval, subtract
+from lmdsl.jets import Jet, apply, enclosure
 from lmdsl.local import LocalController
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
@@ -71,7 +71,8 @@ class LocalCheck:
         """Return one line for people."""
         line = f"{self.kind}: "
         if self.proved is not None:
-            line += f"keeps {self.proved} of {self.cells} attractor cells (proved); "
+            line += f"keeps {self.proved} of {self.cells} attractor cells "
+            line += "(proved for the map as computed); "
         line += f"keeps {self.kept} of {self.samples} random states of A"
         if self.multiplier is not None:
             line += f"; orbit's multiplier {self.multiplier:.4g}"
@@ -199,12 +200,7 @@ def _kept(
     unless its centre is mapped outside: then its cell is lost.
     """
     step, partition = problem.step(), local.partition
-    index = np.stack(partition.multi_index(cells), axis=-1)
-    # Points this close to an edge may count as the cell's own.
-    slack = 2 * EDGE * partition.width
-    low = partition.low + index * partition.width - slack
-    high = partition.low + (index + 1) * partition.width + slack
-    home, work = np.arange(len(cells)), 0.0
+    (low, high, home), work = partition.domain(cells), 0.0
     lost = np.zeros(len(cells), dtype=np.bool_)
     for _ in range(ROUNDS * partition.dimension):
         work += len(home) + OVERHEAD
@@ -239,20 +235,13 @@ def _images(
     high: Floats,
     noise: Floats,
 ) -> list[Interval]:
-    """Enclose T(x, C0(x), w) on boxes: the range itself and the mean value form, intersected."""
-    centre = low / 2 + high / 2
-    box = Interval(low, high)
-    images = _closed(problem, local, step, cell, box, noise)
-    middle = _closed(problem, local, step, cell, Interval.point(centre), noise)
-    away = subtract(box, Interval.point(centre))
-    enclosed = []
-    for image, at in zip(images, middle, strict=True):
-        mean = at.value
-        for k in range(local.partition.dimension):
-            slope = Interval(image.slope.low[k], image.slope.high[k])
-            mean = add(mean, multiply(slope, Interval(away.low[:, k], away.high[:, k])))
-        enclosed.append(intersection(image.value, mean))
-    return enclosed
+    """Enclose T(x, C0(x), w) on boxes."""
+    centre = Interval.point(low / 2 + high / 2)
+    away = subtract(Interval(low, high), centre)
+    steps = [Interval(*(end[:, k] for end in away)) for k in range(local.partition.dimension)]
+    images = _closed(problem, local, step, cell, Interval(low, high), noise)
+    middle = _closed(problem, local, step, cell, centre, noise)
+    return [enclosure(image, at, steps) for image, at in zip(images, middle, strict=True)]
 
 
 def _closed(
@@ -260,17 +249,13 @@ def _closed(
 ) -> tuple[Jet, ...]:
     """Return jets of the closed loop, derivatives with respect to the states."""
     d = local.partition.dimension
-    k = local.owner(cell)
     x = [Jet.variable(Interval(box.low[:, i], box.high[:, i]), i, d) for i in range(d)]
-    values = dict(zip(problem.states, x, strict=True))
-    centre = local.partition.centres(cell)
-    origin = centre - local.deviation(centre, local.orbit[k])  # x_k, turned near to the cell
-    for j, name in enumerate(problem.controls):
-        u = Jet.constant(local.control[k, j], d)
-        for i in range(d):
-            u = u - Jet.constant(local.gain[k, j, i], d) * (x[i] - Jet.constant(origin[:, i], d))
-        u = apply("max", [u, Jet.constant(local.low[j], d)])
-        values[name] = apply("min", [u, Jet.constant(local.high[j], d)])
+
+    def on_jets(operation: str, *operands: Any) -> Any:
+        return apply(operation, [y if isinstance(y, Jet) else Jet.constant(y, d) for y in operands])
+
+    u = local.law(x, cell, on_jets)
+    values = dict(zip((*problem.states, *problem.controls), (*x, *u), strict=True))
     for j, name in enumerate(problem.noises):
         values[name] = Jet.constant(noise[j], d)
     images: tuple[Jet, ...] = step.enclose(values)
@@ -280,29 +265,19 @@ def _closed(
 def _into(
     partition: Partition, attractor: NDArray[np.bool_], images: list[Interval]
 ) -> NDArray[np.bool_]:
-    """Return which image boxes lie in the attractor: every cell that they may meet is one."""
+    """Return which image boxes lie in the attractor: every cell that they may meet is one.
+
+    These are the cells between those of the ends, since locating is monotone (axis.py).
+    """
     count = np.broadcast_shapes(*(np.shape(end) for image in images for end in image))[0]
     sure = np.ones(count, dtype=np.bool_)
     first = np.zeros((len(images), count), dtype=np.int64)
     size = np.ones((len(images), count), dtype=np.int64)
-    for k, image in enumerate(images):
-        low, high = (np.broadcast_to(end, count) for end in image)
-        n, a, h = int(partition.cells[k]), partition.low[k], partition.width[k]
-        bounded = not partition.periodic[k]
-        sure &= np.isfinite(low) & np.isfinite(high)
-        if bounded and partition.clip:
-            low, high = (np.clip(end, a, partition.high[k]) for end in (low, high))
-        t_low, t_high = (low - a) / h, (high - a) / h
-        sure &= (np.abs(t_low) < 2**30) & (np.abs(t_high) < 2**30)
-        sure &= t_high - t_low < MEETS
-        if bounded:
-            sure &= (t_low >= 0) & (t_high <= n)
-        # Either neighbour of an edge may be the cell that locate decides for.
-        down = np.floor(np.where(sure, t_low, 0.0) - 2 * EDGE)
-        up = np.floor(np.where(sure, t_high, 0.0) + 2 * EDGE)
-        if bounded:
-            down, up = np.maximum(down, 0), np.minimum(up, n - 1)
-        first[k], size[k] = down, up - down + 1
+    for k, (image, axis) in enumerate(zip(images, partition.axes, strict=True)):
+        ends = [axis.number(np.broadcast_to(end, count), partition.clip) for end in image]
+        meets = ends[1] - ends[0] + 1
+        sure &= meets <= MEETS  # NaN where an end is out
+        first[k], size[k] = np.where(sure, ends[0], 0), np.where(sure, meets, 1)
     cells = np.prod(size.astype(np.float64), axis=0)
     sure &= cells <= MEETS
     for number in range(int(cells[sure].max(initial=0))):
