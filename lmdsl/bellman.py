@@ -110,7 +110,7 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
     def part(cells: tuple[int, int]) -> None:
         _rise(
             *cells, *lp.kernel,
-            gamma, x, backwards, value, pair,
+            gamma, x.copy(), backwards, value, pair,  # the others keep the values from before
         )  # fmt: skip
 
     over_cells(lp, part, IN_PLACE)
@@ -166,10 +166,9 @@ def _below(  # type: ignore[no-untyped-def]
 
 @kernel
 def _rise(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, V, backwards, value, pair
+    first, last, pair_pointer, pointer, target, code, share, gamma, x, backwards, value, pair
 ):
     first, last = np.uint64(first), np.uint64(last)
-    x = V.copy()  # other ranges keep the values from before the pass
     for t in range(last - first):
         i = last - ONE - t if backwards else first + t
         best, choice = np.inf, pair_pointer[i]

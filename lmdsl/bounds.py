@@ -241,7 +241,7 @@ def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def
     for e in range(pointer[k], pointer[k + ONE]):
         v = V[target[e]]
         if v != 0.0:
-            top = max(top, v)
+            top = v if v > top else top
             q += share[code[e]] * v
     entries = pointer[k + ONE] - pointer[k]
     absolute = np.float64(entries) * LEAST * (1.0 + top) if top > 0.0 else 0.0
@@ -254,10 +254,12 @@ def _careful(k, pointer, target, code, share, gamma, g, V):  # type: ignore[no-u
     q, relative, absolute = _product(k, pointer, target, code, share, V)
     if absolute == 0.0:
         return g
-    future = gamma * max(q * (1.0 - relative) - absolute, 0.0)
+    future = q * (1.0 - relative) - absolute
+    future = gamma * (0.0 if future < 0.0 else future)
     if not future <= LARGEST:
         return g
-    return max((future + g) * (1.0 - 4.0 * UNIT) - 2.0 * LEAST, g)
+    below = (future + g) * (1.0 - 4.0 * UNIT) - 2.0 * LEAST
+    return g if g > below else below
 
 
 @kernel(inline="always")
@@ -268,7 +270,8 @@ def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: 
         q += share[code[e]] * V[target[e]]
     relative = (np.float64(pointer[k + ONE] - pointer[k]) + 8.0) * UNIT
     future = gamma * (q * (1.0 - relative))
-    below = max((future + g) * (1.0 - 4.0 * UNIT), g) if future <= LARGEST else g
+    below = (future + g) * (1.0 - 4.0 * UNIT) if future <= LARGEST else g
+    below = g if g > below else below
     return below if plain else _careful(k, pointer, target, code, share, gamma, g, V)
 
 
@@ -347,7 +350,8 @@ def _excess(  # type: ignore[no-untyped-def]
             excess = V[i] - below
             if excess > 0.0:
                 if cost[k] > 0.0:
-                    worst = max(worst, excess / cost[k] * (1.0 + 4.0 * UNIT))
+                    ratio = excess / cost[k] * (1.0 + 4.0 * UNIT)
+                    worst = ratio if ratio > worst else worst
                 else:
                     stuck = True
     return worst, stuck

@@ -1,8 +1,8 @@
 """Compiled loops: Numba's ``njit`` with a cache of its own, which may be missing.
 
 A kernel is compiled when it is first called with arguments of some types. The result is kept in a
-file, so that this happens once on a machine: in ``NUMBA_CACHE_DIR`` where that is set, beside this
-module, or in the user's folder for caches, the first of these that can be written. Where none can,
+file, so that this happens once on a machine: in ``NUMBA_CACHE_DIR`` where that is set, else beside
+this module, or where that cannot be written in the user's folder for caches. Where there is none,
 kernels are compiled anew in every process; this is said once. Unlike Numba's own cache, this one
 notices a change in a kernel that another calls and a changed constant, needs no index, and holds a
 checksum: what cannot be read, or is not what was written, is compiled again.
@@ -34,8 +34,10 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 log = logging.getLogger(__name__)
 """Says what is compiled (info, with ``busy``) and, once, that it cannot be kept (warning)."""
 
-OPTIONS = {"nogil": True, "no_cfunc_wrapper": True, "no_rewrites": True}
-"""Options of every kernel. What no kernel needs is not compiled either."""
+OPTIONS = {
+    "nogil": True, "no_cfunc_wrapper": True, "no_rewrites": True, "error_model": "numpy",
+}  # fmt: skip
+"""Options of every kernel. What no kernel needs is not compiled: none divides by zero."""
 
 
 def _started() -> tuple[Any, str]:
@@ -156,10 +158,11 @@ def folders() -> tuple[Path, ...]:
     """Return the folders in which compiled kernels are looked for and kept, the first first."""
     here = Path(__file__).resolve().parent
     own = f"lmdsl-{hashlib.sha256(os.fsencode(here)).hexdigest()[:12]}"
-    named = numba.config.CACHE_DIR
+    if numba.config.CACHE_DIR:
+        return (Path(numba.config.CACHE_DIR, own),)
     users = Path(numba.misc.appdirs.user_cache_dir("lmdsl", appauthor=False))
-    places = [*([Path(named, own)] if named else []), here / "__pycache__"]
-    return tuple([*places, users / own] if users.is_absolute() else places)  # else it begins with ~
+    beside = here / "__pycache__"
+    return (beside, users / own) if users.is_absolute() else (beside,)  # else it begins with ~
 
 
 def _write(path: Path, data: bytes) -> None:

@@ -14,7 +14,7 @@ from lmdsl.sweeps import ONE
 
 @kernel
 def merge(  # type: ignore[no-untyped-def]
-    index, cells_last, mean, number, group, bits, first_code, key,
+    index, cells_last, mean, number, group, bits, first_code, key, high, wide,
     per_cell, control, cost, end, target, code,
 ):  # fmt: skip
     """Turn the image cells of every pair into a row: sorted (target, code), equal ones counted.
@@ -34,7 +34,9 @@ def merge(  # type: ignore[no-untyped-def]
         Code of one sample of each group; n samples have ``first_code + n - 1``.
     key
         Room for ``target << bits | group`` of the samples of a tile, an integer type wide enough
-        for it, shape (S, cells * controls) with the numbers of :func:`tile`.
+        for it, shape (S, high * wide).
+    high, wide
+        Cells and controls of a tile: :func:`tile`.
     per_cell, control, cost, end, target, code
         Results. Admissible pairs of each cell (zeros on entry); for each of them, ordered by cell,
         then control, its control, mean cost and the end of its row; the rows one after the other.
@@ -48,19 +50,25 @@ def merge(  # type: ignore[no-untyped-def]
     down, right = np.uint64(len(mean) > 1), np.uint64(mean.shape[1] > 1)
     cells = len(per_cell)
     controls = index.shape[0] * index.shape[2] // cells
-    high, wide = tile(cells_last, controls)
     for c0 in range(0, cells, high):
         for a0 in range(0, controls, wide):
-            c1, a1 = min(c0 + high, cells), min(a0 + wide, controls)
-            _keys(index, cells_last, c0, c1, a0, a1, number, group, bits, key)
-            _sort(key, (c1 - c0) * (a1 - a0))
+            c1 = c0 + high if c0 + high < cells else cells
+            a1 = a0 + wide if a0 + wide < controls else controls
+            across = a1 - a0
+            _keys(
+                index, np.uint64(a0 if cells_last else c0), np.uint64(a1 if cells_last else c1),
+                np.uint64(c0 if cells_last else a0), np.uint64(c1 if cells_last else a1),
+                np.uint64(1 if cells_last else across), np.uint64(across if cells_last else 1),
+                number, group, bits, key,
+            )  # fmt: skip
+            _sort(key, np.uint64((c1 - c0) * (a1 - a0)))
             k = np.uint64(0)
             for c in range(c0, c1):
                 for a in range(a0, a1):
                     if key[0, k] >= 0:  # a sample that leaves has a negative key, now the first
                         entries = _row(key, k, bits, first_code, entries, target, code)
-                        i, j = (a, c) if cells_last else (c, a)
-                        cost[pairs] = mean[down * np.uint64(i), right * np.uint64(j)]
+                        i, j = np.uint64(a if cells_last else c), np.uint64(c if cells_last else a)
+                        cost[pairs] = mean[down * i, right * j]
                         control[pairs], end[pairs] = a, entries
                         per_cell[c] += 1
                         pairs += ONE
@@ -68,8 +76,7 @@ def merge(  # type: ignore[no-untyped-def]
     return pairs, entries
 
 
-@kernel
-def tile(cells_last, controls):  # type: ignore[no-untyped-def]
+def tile(cells_last: bool, controls: int) -> tuple[int, int]:
     """Return how many cells and controls are sorted at a time.
 
     Their keys stay in the first-level cache, and images are read by the cache line.
@@ -78,28 +85,21 @@ def tile(cells_last, controls):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _keys(index, cells_last, c0, c1, a0, a1, number, group, bits, key):  # type: ignore[no-untyped-def]
+def _keys(index, f0, f1, l0, l1, down, right, number, group, bits, key):  # type: ignore[no-untyped-def]
     """Gather ``target << bits | group`` of every sample of a tile, columns by cell and control.
 
-    All samples of a pair one after the other: they land near each other, in ``number`` too.
+    A step along the first axis of ``index`` is ``down`` columns, along the last ``right``. All
+    samples of a pair one after the other: they land near each other, in ``number`` too.
     """
-    wide = a1 - a0
-    if cells_last:
-        for a in range(a0, a1):
-            for s in range(len(key)):
-                _gather(index[a, s, c0:c1], number, group[s], bits, key[s, a - a0 :: wide])
-    else:
-        for c in range(c0, c1):
-            for s in range(len(key)):
-                _gather(index[c, s, a0:a1], number, group[s], bits, key[s, (c - c0) * wide :])
-
-
-@kernel
-def _gather(line, number, group, bits, key):  # type: ignore[no-untyped-def]
-    for i in range(len(line)):
-        inside = line[i] >= 0.0
-        t = number[np.uint64(np.int64(line[i] if inside else 0.0))]  # unsigned: not from the end
-        key[i] = ((t if inside else -1) << bits) | group
+    for f in range(f0, f1):
+        for s in range(np.uint64(len(key))):
+            column = (f - f0) * down
+            for x in range(l0, l1):
+                image = index[f, s, x]
+                inside = image >= 0.0
+                t = number[np.uint64(np.int64(image if inside else 0.0))]  # not from the end
+                key[s, column] = ((t if inside else -1) << bits) | group[s]
+                column += right
 
 
 @kernel
@@ -119,17 +119,13 @@ def _sort(key, count):  # type: ignore[no-untyped-def]
         while d > 0:
             for s in range(S - d):
                 if s & p == r:
-                    _exchange(key[s], key[s + d], count)
+                    low, high = np.uint64(s), np.uint64(s + d)
+                    for i in range(count):
+                        a, b = key[low, i], key[high, i]
+                        key[low, i] = a if a < b else b
+                        key[high, i] = b if a < b else a
             d, q, r = q - p, q // 2, p
         p //= 2
-
-
-@kernel
-def _exchange(low, high, count):  # type: ignore[no-untyped-def]
-    for i in range(count):
-        a, b = low[i], high[i]
-        low[i] = a if a < b else b
-        high[i] = b if a < b else a
 
 
 @kernel
@@ -160,7 +156,7 @@ def add_cost(cost, weight, mean, least):  # type: ignore[no-untyped-def]
         mean[j] += weight * cost[j]
 
 
-@kernel(error_model="numpy")
+@kernel
 def settle_cost(mean, least, total):  # type: ignore[no-untyped-def]
     """Turn sums into means, NaN where a sample was negative or not finite."""
     for j in range(len(mean)):
@@ -168,8 +164,8 @@ def settle_cost(mean, least, total):  # type: ignore[no-untyped-def]
         mean[j] = g if (least[j] >= 0.0) & (g < np.inf) else np.nan
 
 
-@kernel(error_model="numpy")
-def mean_cost(cost, points, weights, mean):  # type: ignore[no-untyped-def]
+@kernel
+def mean_cost(cost, points, weights, mean, least):  # type: ignore[no-untyped-def]
     """Average the stage cost over points and nodes, NaN where a sample is negative or not finite.
 
     Parameters
@@ -183,13 +179,15 @@ def mean_cost(cost, points, weights, mean):  # type: ignore[no-untyped-def]
     mean
         Shape (first, last), zeros on entry; the sum of weight times cost, in the order of the
         samples, over the total weight.
+    least
+        Room in the shape of ``mean``, zeros on entry.
     """
-    total = points * weights.sum()
-    for i in range(len(mean)):
-        line = mean[i]
-        least = np.zeros(len(line))
-        for p in range(points):
-            for q in range(len(weights)):
-                row = cost[i, min(p, cost.shape[1] - 1), min(q, cost.shape[2] - 1)]
-                add_cost(row, weights[q], line, least)
-        settle_cost(line, least, total)
+    total = 0.0
+    for weight in weights:
+        total += weight
+    down, right = np.uint64(cost.shape[1] > 1), np.uint64(cost.shape[2] > 1)
+    for i in range(np.uint64(len(mean))):
+        for p in range(np.uint64(points)):
+            for q in range(np.uint64(len(weights))):
+                add_cost(cost[i, p * down, q * right], weights[q], mean[i], least[i])
+        settle_cost(mean[i], least[i], points * total)

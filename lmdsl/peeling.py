@@ -64,7 +64,8 @@ class Peeled:
         n = len(system.begin)
         order = np.empty(n + int(BYTE), dtype=np.uint32)
         ends = np.empty(n + 1, dtype=np.int64)
-        count, levels = _peel(system.begin, system.end, system.indices, order, ends)
+        ways, free = np.zeros(n, dtype=np.uint32), np.zeros(n // int(WORD) + 1, dtype=np.uint64)
+        count, levels = _peel(system.begin, system.end, system.indices, order, ends, ways, free)
         order, ends = order[:n], ends[:levels].copy()
         if not count:
             return cls(system, order[:0], ends, order, system)
@@ -132,13 +133,14 @@ class Peeled:
 
 
 @kernel
-def _peel(begin, end, indices, order, ends):  # type: ignore[no-untyped-def]
+def _peel(begin, end, indices, order, ends, ways, free):  # type: ignore[no-untyped-def]
     """Order the cells outside the core, then those in it; return how many are outside, and levels.
 
-    No branch depends on data: every cell is written and only those that count are kept.
+    ``ways`` counts the entries that lead to a cell, ``free`` has a bit for each cell of the next
+    level; both are zeros on entry. No branch depends on data: every cell is written and only those
+    that count are kept.
     """
     n = np.uint64(len(begin))
-    ways = np.zeros(n, dtype=np.uint32)  # how many entries lead to a cell
     for i in range(n):
         for e in range(begin[i], end[i]):
             ways[indices[e]] += np.uint32(1)
@@ -146,7 +148,6 @@ def _peel(begin, end, indices, order, ends):  # type: ignore[no-untyped-def]
     for i in range(n):
         order[count] = i
         count += np.uint64(ways[i] == 0)
-    free = np.zeros(n // WORD + ONE, dtype=np.uint64)  # cells of the next level, a bit each
     while at < count:
         ends[levels] = last = count
         levels += 1
@@ -159,7 +160,8 @@ def _peel(begin, end, indices, order, ends):  # type: ignore[no-untyped-def]
                 ways[j] = left
                 word = j // WORD
                 free[word] |= np.uint64(left == 0) << (j % WORD)
-                low, high = min(low, word), max(high, word)
+                low = word if word < low else low
+                high = word if word > high else high
                 order[count] = j
                 count += np.uint64(left == 0)
         if low <= high and high - low > FAR * (count - last):  # few, far apart: as they came

@@ -255,7 +255,8 @@ def _longest(first, last, pair_pointer, pointer, room):  # type: ignore[no-untyp
     for i in range(np.uint64(first), np.uint64(last)):
         most = np.uint64(0)
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
-            most = max(most, pointer[k + ONE] - pointer[k])
+            length = pointer[k + ONE] - pointer[k]
+            most = length if length > most else most
         room[i] = most
 
 

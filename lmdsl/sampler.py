@@ -189,7 +189,7 @@ class Sampler:
         if cost.ndim < 4:
             cost = cost.reshape((1,) * (4 - cost.ndim) + cost.shape)
         mean = np.zeros((cost.shape[0], cost.shape[3]))
-        mean_cost(fixed(cost), len(self.points), self.nodes.weights, mean)
+        mean_cost(fixed(cost), len(self.points), self.nodes.weights, mean, mean.copy())
         return mean
 
 

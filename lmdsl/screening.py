@@ -110,7 +110,7 @@ class Screen:
 
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(
-                *cells, lp.kernel[0], self.cost, x, own, margin, self.scale, backwards,
+                *cells, lp.kernel[0], self.cost, x.copy(), own, margin, self.scale, backwards,
                 self.rival, value, new.view(np.uint64), self.paid, *slots,
             )  # fmt: skip
             return int(changed), int(looked)
@@ -142,12 +142,13 @@ class Screen:
         first, own = np.empty(lp.n, dtype=np.int64), pair.view(np.uint64)
         known = self.pair is not None and np.array_equal(self.pair, pair)
         rival = self.rival if known else np.zeros(lp.n)
+        most = int(np.diff(lp.pair_pointer).max(initial=0))
 
         def part(cells: tuple[int, int]) -> bool:
             several = _ties(
                 *cells, *lp.kernel,
                 self.cost, self.gamma, x, tolerance, self.scale, rival, own, ties,
-                first,
+                first, np.empty(most),
             )  # fmt: skip
             return bool(several)
 
@@ -173,16 +174,17 @@ def _least_ratio(before, after):  # type: ignore[no-untyped-def]
 
 @kernel
 def _pass(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, cost, V, pair, margin, scale, backwards, rival, value, new, paid,
+    first, last, pair_pointer, cost, x, pair, margin, scale, backwards, rival, value, new, paid,
     held, pointer, target, code, share, columns, gamma, begins, ends, indices, data, inverse,
 ):  # fmt: skip
     """Improve the cells of a range in turn; ``rival`` gets the bounds of those that were read.
+
+    ``x`` is V, a copy for each range: the others keep the values from before the pass.
 
     V_i >= Q of the cell's own pair, so where the bound of the rivals is V_i or more none is better.
     """
     changed, looked = 0, np.uint64(0)
     first, last = np.uint64(first), np.uint64(last)
-    x = V.copy()  # other ranges keep the values from before the pass
     store, shrink = (1.0 - 1e-12) / scale, 1.0 / scale
     for t in range(last - first):
         i = last - ONE - t if backwards else first + t
@@ -229,18 +231,14 @@ def _pass(  # type: ignore[no-untyped-def]
 @kernel
 def _ties(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, tolerance, scale,
-    rival, pair, ties, chosen,
+    rival, pair, ties, chosen, q,
 ):  # fmt: skip
     """Mark the tied columns of a range of cells: first Q_min, then all that come near.
 
-    Where no rival comes near, no row is read.
+    Where no rival comes near, no row is read. ``q`` is room for the pairs of a cell.
     """
     several = False
     first, last = np.uint64(first), np.uint64(last)
-    most = np.uint64(0)
-    for i in range(first, last):
-        most = max(most, pair_pointer[i + ONE] - pair_pointer[i])
-    q = np.empty(most)
     for i in range(first, last):
         begin, end = pair_pointer[i], pair_pointer[i + ONE]
         if rival[i] * scale > V[i] * (1.0 + tolerance + 1e-9):
@@ -254,7 +252,7 @@ def _ties(  # type: ignore[no-untyped-def]
             for e in range(pointer[k], pointer[k + ONE]):
                 q_k += share[code[e]] * V[target[e]]
             q[k - begin] = gamma * q_k + cost[k]
-            best = min(best, q[k - begin])
+            best = q[k - begin] if q[k - begin] < best else best
         count, chosen[i] = 0, -1
         for k in range(begin, end):
             ties[k] = (q[k - begin] <= best + tolerance * abs(best)) | (k == pair[i])

@@ -147,20 +147,20 @@ def _gauss_seidel(  # type: ignore[no-untyped-def]
     halfway, change, top = np.inf, np.inf, 0.0
     for sweep in range(count):
         measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
-        order, downwards = cycle[sweep % len(cycle)]
-        found = _sweep(
+        turn = sweep % len(cycle)
+        moved, most, highest = _sweep(
             0, len(b), begin, end, indices, data, inverse, b, x, x,
-            orders[order], downwards == 1, measured, top,
+            orders[cycle[turn, 0]], cycle[turn, 1] == 1, measured, top,
         )  # fmt: skip
         if measured:
-            change, top = found[0], found[2]
+            change, top = moved, highest
             if not top < CEILING:
                 return halfway, np.inf
             if sweep == count // 2:
                 halfway = change
             if change <= enough:
                 break
-            if found[1] <= flat:
+            if most <= flat:
                 return halfway, 0.0
     return halfway, change
 
@@ -189,10 +189,11 @@ def _sweep(  # type: ignore[no-untyped-def]
         y *= inverse[i]
         if measured:
             moved = abs(y - x[i])
-            if moved > change * max(y, floor):
-                change = moved / max(y, floor)
-            most = max(most, moved)
-            highest = max(highest, y)
+            size = floor if floor > y else y
+            if moved > change * size:
+                change = moved / size
+            most = moved if moved > most else most
+            highest = y if y > highest else highest
         x[i] = y
     return change, most, highest
 

@@ -226,7 +226,7 @@ class _Assembler:
         key = np.empty((sampler.samples, high * wide), dtype=self.key)
         pairs, entries = merge(
             index, block.cells_last, mean, self.number, self.group, self.bits, self.first_code,
-            key, per_cell, control, cost, end, target, code,
+            key, high, wide, per_cell, control, cost, end, target, code,
         )  # fmt: skip
         control, cost = control[:pairs], cost[:pairs]
         if block.controls[0]:
