@@ -123,12 +123,7 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
         if w is not None:
             yield Feasible(better.pair, w)
             return
-    if g > 1:
-        decided = _decided(lp, stop)
-        yield decided
-        if not isinstance(decided, Undecided):
-            return
-    unit = np.ones(lp.K)
+    unit, asked = np.ones(lp.K), g == 1
     for horizon in (4.0 * level.max(), 64.0 * level.max()):
         at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
         for _ in range(4):
@@ -138,6 +133,11 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
             yield Undecided(pair, at) if w is None else Feasible(pair, w)
             if stop():
                 return
+            if not asked:
+                asked, decided = True, _decided(lp, stop)
+                yield decided
+                if not isinstance(decided, Undecided):
+                    return
             if done.converged:
                 break
     for _ in range(200):
