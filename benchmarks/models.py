@@ -102,6 +102,38 @@ def lorenz(cells: int) -> Model:
     )
 
 
+def boost_converter(cells: int) -> Model:
+    """Return safety as a problem of lmdsl: a random kill is the goal, and the only one.
+
+    The converter of Girard, Pola and Tabuada (2010) has two modes and stays in a box as long as the
+    controller wants; each step ends the run with probability 0.01.
+    """
+    first = "0.9917012926388760 * i + 0.1659741472224808"
+    second = "0.9902950294282973 * i - 0.0328923188237173 * v + 0.1658729187526563"
+    low, high = 1.14975, 1.54975
+    edge = low + (high - low) / cells  # the first cells are the goal: flows must not enter
+    image = f"where(mode == 1, {first}, {second})"
+    return Model(
+        f"boost-converter-{cells}",
+        lambda: lm.Problem.model_validate({
+            "format": "lmdsl/1",
+            "system": {"kind": "map", "next": {
+                "i": f"where(kill == 1, {low + 0.5 * (edge - low)!r},"
+                     f" where({image} < {edge!r}, 99, {image}))",
+                "v": "where(kill == 1, 5.65, where(mode == 1, 0.9929178767321044 * v,"
+                     " 0.0352417701682685 * i + 0.9923331784696955 * v + 0.0029450833173848))",
+            }},
+            "state_box": {"i": {"low": low, "high": high, "cells": cells},
+                          "v": {"low": 5.45025, "high": 5.84975, "cells": max(cells - 1, 1)}},
+            "attractor": {"boxes": [{"i": [low, edge]}]},
+            "control_grid": {"mode": {"values": [1, 2]}},
+            "noise": {"kill": {"values": [0, 1], "weights": [0.99, 0.01]}},
+            "stage_cost": "1",
+            "sampling": {"kind": "grid", "per_axis": 2},
+        }),
+    )  # fmt: skip
+
+
 def random_model(cells: int) -> Model:
     """Return a random sparse model: 10 controls, about 4 successors anywhere, no locality."""
     return Model(f"random-{cells}", lambda: internals.random_lp(cells, 10, 4, 10))
@@ -124,6 +156,7 @@ MAKERS: dict[str, Callable[[int], Model]] = {
     "pendulum-on-cart": pendulum_on_cart,
     "slow-pendulum": slow,
     "lorenz": lorenz,
+    "boost-converter": boost_converter,
     "random": random_model,
 }
 

@@ -43,3 +43,16 @@ def run(name: str, gamma: float | None, repeats: int) -> dict[str, Any]:
         "peak": used,
         "estimates": seen,
     }
+
+
+def bracket(name: str, width: float, repeats: int) -> dict[str, Any]:
+    """Enclose gamma_bar of a model, with the kernels loaded; all times in seconds."""
+    lm.gamma_max(models.get(models.WARM).compiled(1.0))
+    lp = models.get(name).compiled(1.0)
+    times: dict[str, list[float]] = {"compile": [0.0], "total": []}
+    for _ in range(repeats):
+        lp = internals.cold(lp)
+        started = time.perf_counter()
+        found = lm.gamma_max(lp, width=width)
+        times["total"].append(time.perf_counter() - started)
+    return {"model": name, "gamma_bar": [found.low, found.high], "seconds": times}

@@ -112,6 +112,11 @@ class Run:
             self.save()
         return self.pipelines[key]
 
+    def bracket(self, name: str, width: float) -> dict[str, Any]:
+        """Return the times of enclosing gamma_bar of a model to a relative width."""
+        self.log(f"{name}: gamma_bar to {width:g}")
+        return self._called("benchmarks.pipeline:bracket", name, width, self.rules.repeats)
+
     def _called(self, function: str, *arguments: Any) -> dict[str, Any]:
         try:
             result: dict[str, Any] = call(function, *arguments, limit=2 * self.rules.limit)

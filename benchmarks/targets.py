@@ -34,6 +34,8 @@ def _all(run: Run, largest: int) -> Iterator[dict[str, Any]]:
     yield from _sizes(run, largest)
     yield from _small(run)
     yield from _slow(run)
+    yield from _far(run)
+    yield from _lossless(run)
 
 
 def _target(target: str, goal: str, measured: str, met: bool | None) -> dict[str, Any]:
@@ -188,3 +190,34 @@ def _slow(run: Run) -> Iterator[dict[str, Any]]:
     parts = ", ".join(f"{stage} {ratio(stage):.3g}" for stage in ("solve", "verify", "compile"))
     judged = ratio("solve", "verify")
     yield _target(label, "at most 3", f"{judged:.3g} ({parts})", judged <= 3)
+
+
+def _far(run: Run) -> Iterator[dict[str, Any]]:
+    """Measure gamma far beyond gamma_bar: its refusal with the bracket, and the bracket alone."""
+    name, repeats = "standard-map-200", run.rules.repeats
+    near = run.pipeline(name, 1.0, processes=repeats)
+    far, limit = run.pipeline(name, 5.0, processes=repeats), run.bracket(name, 0.01)
+    for what, found in (("gamma = 5 refused", far), ("gamma_bar to 1 %", limit)):
+        label = f"{what}, of solve and verify at gamma = 1, {name}"
+        if "failed" in near or "failed" in found:
+            yield _unmeasured(label, "at most 20", near.get("failed") or found["failed"])
+            continue
+        ratio = _after_compiling(found) / _after_compiling(near)
+        yield _target(label, "at most 20", f"{ratio:.3g}", ratio <= 20)
+
+
+def _after_compiling(found: dict[str, Any]) -> float:
+    times = found["seconds"]
+    return statistics.median(times["total"]) - statistics.median(times["compile"])
+
+
+def _lossless(run: Run) -> Iterator[dict[str, Any]]:
+    """Measure a problem whose runs end with probability 0.01 a step, and no other way."""
+    name = "boost-converter-800"
+    label, found = f"compile, solve and verify, {name}", run.pipeline(name, 1.0)
+    if "failed" in found:
+        yield _unmeasured(label, "8 s", found["failed"])
+        return
+    total = statistics.median(found["seconds"]["total"])
+    text = f"{seconds(total)}, {found['status']}"
+    yield _target(label, "8 s", text, found["status"] == "verified" and total <= 8)

@@ -14,7 +14,7 @@ import lmdsl as lm
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT))
 
-from benchmarks import measure, models, report, rivals, targets  # noqa: E402
+from benchmarks import measure, models, pipeline, report, rivals, targets  # noqa: E402
 from benchmarks import run as running  # noqa: E402
 from benchmarks.arrays import Arrays  # noqa: E402
 from benchmarks.process import Failed, call  # noqa: E402
@@ -317,13 +317,16 @@ class Canned:
         return {"rows": [*rows, {"what": "compile", "seconds": 0.5},
                          {"what": "solve", "seconds": 1.0, "ratio": 41.0}]}  # fmt: skip
 
+    def bracket(self, name, width):
+        return {"failed": "> 1 s"} if self.broken else self.pipeline(name)
+
     def pipeline(self, name, gamma=None, repeats=1, processes=1):
         if self.broken:
             return {"model": name, "failed": "> 1 s"}
-        stages = ("compile", "solve", "verify", "total")
+        times = {stage: [1.0, 1.0] for stage in ("compile", "solve", "verify")}
         return {
             "pairs": self.pairs, "status": "verified", "base": 10**9, "peak": 2 * 10**9,
-            "estimates": [1, 8 * 10**8], "seconds": {stage: [1.0, 1.0] for stage in stages},
+            "estimates": [1, 8 * 10**8], "seconds": {**times, "total": [2.0, 2.0]},
         }  # fmt: skip
 
 
@@ -357,7 +360,26 @@ def test_targets_are_judged(monkeypatch):
         f"{command}, kernels cached": False,
         f"{command}, first ever": True,
         "slow-pendulum-200, solve and verify per pair over standard-map-200": True,
+        "gamma = 5 refused, of solve and verify at gamma = 1, standard-map-200": True,
+        "gamma_bar to 1 %, of solve and verify at gamma = 1, standard-map-200": True,
+        "compile, solve and verify, boost-converter-800": True,
     }
+
+
+def test_the_bracket_of_gamma_is_measured():
+    found = pipeline.bracket("standard-map-8", 0.01, 2)
+    low, high = found["gamma_bar"]
+    assert 1 < low <= high <= 1.01 * low
+    assert len(found["seconds"]["total"]) == 2
+
+
+def test_the_boost_converter_is_absorbed_by_chance_alone():
+    lp = models.get("boost-converter-60").compiled()
+    result = lm.solve(lp)
+    assert result.status == "verified", result.message
+    assert 0 < result.cost <= 100 * (1 + 1e-6)
+    absorbed = 1 - lp.rows.matrix().sum(axis=1)
+    np.testing.assert_allclose(absorbed, 0.01, rtol=1e-9)
 
 
 def test_a_target_that_could_not_be_measured_is_not_met(monkeypatch):
