@@ -24,7 +24,7 @@ from lmdsl.intervals import Interval
 from lmdsl.jets import Jet
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.sampling import Nodes, control_values, noise_nodes
+from lmdsl.sampling import Nodes, control_range, noise_nodes
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -83,10 +83,9 @@ class LocalController(Frozen):
         declared = problem.local_controller
         if declared is None:
             return None
-        values = control_values(problem)
-        low, high = (np.array([f(v) for v in values]) for f in (np.min, np.max))
+        low, high = control_range(problem)
         where = "local_controller"
-        p, d = len(values), partition.dimension
+        p, d = len(low), partition.dimension
         if isinstance(declared, ConstantControl):
             control = np.array([[declared.control.get(name, 0.0) for name in problem.controls]])
             _within(control, low, high, problem.controls, where)
@@ -107,7 +106,7 @@ class LocalController(Frozen):
         _inside(orbit, partition, attractor)
         mean = _mean_noise(noise_nodes(problem))
         _refuse_unless_orbit(problem, partition, orbit, control, mean)
-        width, reach = partition.width, _reach(values, control)
+        width, reach = partition.width, _reach(low, high, control)
         jacobian = _jacobian(problem, orbit, control, mean, np.concatenate([width, reach]))
         A, B = jacobian[:, :, :d], jacobian[:, :, d:]
         smooth = bool(np.isfinite(jacobian).all())
@@ -232,10 +231,10 @@ def _refuse_unless_orbit(
             )
 
 
-def _reach(values: list[Floats], control: Floats) -> Floats:
+def _reach(low: Floats, high: Floats, control: Floats) -> Floats:
     """Return the largest distance from a control of the orbit to a value; 1 where it is 0."""
-    far = [np.abs(v[:, None] - control[None, :, j]).max() for j, v in enumerate(values)]
-    return np.array([float(x) or 1.0 for x in far])
+    far = np.maximum(np.abs(low - control), np.abs(high - control)).max(axis=0)
+    return np.where(far > 0, far, 1.0)
 
 
 def _jacobian(

@@ -30,7 +30,7 @@ from lmdsl.regions import Regions
 from lmdsl.rows import Rows
 from lmdsl.sampling import control_vectors
 from lmdsl.surroundings import own_arithmetic
-from lmdsl.transitions import Progress, assemble
+from lmdsl.transitions import Progress, assemble, require_least
 
 Floats = NDArray[np.float64]
 
@@ -302,6 +302,7 @@ def compile(  # noqa: A001
     deadline = Deadline.of(time_limit)
     inputs.kind(problem, Problem, "problem", "a Problem")
     partition = Partition.of(problem)
+    require_least(problem)
     if problem.local_controller is not None:  # refuse a wrong one before the work
         LocalController.of(problem, partition, Regions.of(problem, partition).attractor)
     transitions = assemble(problem, partition, progress, deadline)

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from lmdsl.errors import BadInput
 
+TRIFLE = 2**24  # bytes that need no asking
 UNKNOWN = 8 * 2**30  # where the operating system does not say
 UNLIMITED = 2**60  # version 1 writes its largest number of pages
 
@@ -42,14 +43,21 @@ def available(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -
     return Room(max(least.bytes, 0), least.limit)
 
 
-def require(estimate: int, what: str) -> None:
-    """Refuse work whose estimate exceeds the available memory.
+def fits(estimate: float) -> bool:
+    """Return whether so many bytes are available."""
+    return estimate <= TRIFLE or estimate <= available().bytes
+
+
+def require(estimate: float, what: str) -> None:
+    """Refuse work whose estimate exceeds the available memory, before any of it is taken.
 
     Raises
     ------
     BadInput
         With the estimate, the limit and the fix.
     """
+    if estimate <= TRIFLE:
+        return
     room = available()
     if estimate > room.bytes:
         raise BadInput(

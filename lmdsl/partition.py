@@ -213,11 +213,12 @@ class Partition(Frozen):
             for k, index in enumerate(self.multi_index(cell))
         ]
 
-    def mask(self, blocks: Iterable[tuple[Indices, ...]]) -> Bools:
-        """Return which cells lie in a union of blocks (one index array per axis each)."""
+    def mask(self, blocks: Iterable[tuple[Indices | range, ...]]) -> Bools:
+        """Return which cells lie in a union of blocks (on each axis a range, or an index array)."""
         inside = np.zeros(self.shape, dtype=np.bool_)
         for block in blocks:
-            inside[np.ix_(*block)] = True
+            spans = [slice(a.start, a.stop) for a in block if isinstance(a, range)]
+            inside[tuple(spans) if len(spans) == len(block) else np.ix_(*block)] = True
         return inside.ravel()
 
     def around_point(self, point: Sequence[float], where: str) -> tuple[Indices, ...]:
@@ -237,7 +238,7 @@ class Partition(Frozen):
             block.append(np.unique(touched % n if axis.periodic else np.clip(touched, 0, n - 1)))
         return tuple(block)
 
-    def inside_box(self, box: Mapping[str, tuple[float, float]], where: str) -> tuple[Indices, ...]:
+    def inside_box(self, box: Mapping[str, tuple[float, float]], where: str) -> tuple[range, ...]:
         """Return the block of cells inside a box, up to 1e-9 widths."""
 
         def cells(ta: float, tb: float) -> tuple[float, float]:
@@ -247,7 +248,7 @@ class Partition(Frozen):
 
     def overlapping_box(
         self, box: Mapping[str, tuple[float, float]], where: str
-    ) -> tuple[Indices, ...]:
+    ) -> tuple[range, ...]:
         """Return the block of cells whose interior overlaps a box by more than 1e-9 widths."""
 
         def cells(ta: float, tb: float) -> tuple[float, float]:
@@ -262,12 +263,12 @@ class Partition(Frozen):
         box: Mapping[str, tuple[float, float]],
         where: str,
         cells: Callable[[float, float], tuple[float, float]],
-    ) -> tuple[Indices, ...]:
+    ) -> tuple[range, ...]:
         block = []
         for k, name in enumerate(self.names):
             n = int(self.cells[k])
             if name not in box:
-                block.append(np.arange(n))
+                block.append(range(n))
                 continue
             a, b = box[name]
             ta, tb = (_units(end, self.low[k], self.width[k]) for end in (a, b))
@@ -278,7 +279,8 @@ class Partition(Frozen):
                     f"{where}.{name}",
                 )
             first, last = cells(*(min(max(float(t), -2.0), n + 2.0) for t in (ta, tb)))
-            block.append(np.arange(max(int(first), 0), min(int(last), n - 1) + 1))
+            begin, end = max(int(first), 0), min(int(last), n - 1) + 1
+            block.append(range(begin, max(begin, end)))
         return tuple(block)
 
 

@@ -50,6 +50,8 @@ class Program:
         What a call does, and the slots of its results.
     operations
         The operations of one call in order, for inspection.
+    live
+        Largest number of arrays at a time, inputs apart.
     effort, work
         Their number, at least 1; the same with functions such as the sine counted many times, for
         the time they take.
@@ -103,6 +105,11 @@ class Program:
             in_place = step.operation in PLAIN
             reusable = tuple(k for k in released if in_place and k not in inputs)
             marked.append(step._replace(released=released, reusable=reusable))
+        held = self.live = 0
+        for step in reversed(marked):
+            held += 1
+            self.live = max(self.live, held + 1)  # an operation may need one more for itself
+            held -= sum(k not in inputs for k in step.released)
         return marked[::-1]
 
     def part(self, outputs: Sequence[int]) -> Program:

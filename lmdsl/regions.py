@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl import memory
 from lmdsl.errors import BadInput
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.program import Program
+
+CELL = 32
+"""Bytes of a cell while the sets are made."""
+
+PART = 2**16
+"""Cells of which the density is evaluated at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +63,7 @@ class Regions:
             A point or index lies outside the box, a set has no cell, or a cell is both
             attractor and avoid.
         """
+        memory.require(CELL * partition.size, "the sets of cells")
         attractor = _attractor(problem, partition)
         avoid = np.zeros(partition.size, dtype=np.bool_)
         if problem.avoid:
@@ -88,10 +97,11 @@ def _mass(problem: Problem, partition: Partition) -> NDArray[np.float64]:
             )
         mass = np.array(measure.weights)
     elif density is not None:
-        centres = partition.centres(np.arange(partition.size))
         program = Program([density], problem.system.constants())
-        values = program(dict(zip(partition.names, centres.T, strict=True)))[0]
-        mass = np.array(np.broadcast_to(values, partition.size))
+        for start in range(0, partition.size, PART):
+            some = np.arange(start, min(start + PART, partition.size))
+            centres = partition.centres(some)
+            mass[some] = program(dict(zip(partition.names, centres.T, strict=True)))[0]
         bad = np.flatnonzero(~((mass >= 0) & np.isfinite(mass)))
         if len(bad):
             index = [int(k) for k in np.unravel_index(bad[0], partition.shape)]
@@ -114,16 +124,17 @@ def _mass(problem: Problem, partition: Partition) -> NDArray[np.float64]:
 
 def _attractor(problem: Problem, partition: Partition) -> NDArray[np.bool_]:
     declared = problem.attractor
-    blocks = [
+    points = (
         partition.around_point(
             [point[name] for name in partition.names] if isinstance(point, dict) else point,
             f"attractor.points[{i}]",
         )
         for i, point in enumerate(declared.points)
-    ]
-    blocks += [
+    )
+    boxes = (
         partition.inside_box(box, f"attractor.boxes[{i}]") for i, box in enumerate(declared.boxes)
-    ]
+    )
+    cells = (tuple(np.array([index]) for index in cell) for cell in declared.cells)
     for i, cell in enumerate(declared.cells):
         for k, index in enumerate(cell):
             if index >= partition.cells[k]:
@@ -132,8 +143,7 @@ def _attractor(problem: Problem, partition: Partition) -> NDArray[np.bool_]:
                     f"{partition.names[k]}",
                     f"attractor.cells[{i}]",
                 )
-        blocks.append(tuple(np.array([index]) for index in cell))
-    mask = partition.mask(blocks)
+    mask = partition.mask(itertools.chain(points, boxes, cells))  # one at a time
     if not mask.any():
         raise BadInput("no cell lies inside the boxes; enlarge them or give points", "attractor")
     return mask

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import warnings
 from dataclasses import dataclass
@@ -11,15 +10,20 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.problem import ControlValues, Grid, NoiseNormal, Problem, Random
+from lmdsl import memory
+from lmdsl.problem import ControlRange, ControlValues, Grid, NoiseNormal, Problem, Random
 
 Floats = NDArray[np.float64]
+
+NODE = 400
+"""Bytes for each noise node: its values, its weight, and what orders them."""
 
 
 def offsets(problem: Problem) -> Floats:
     """Return the sample offsets within a cell, shape (points, d), in [0, 1)."""
     d = len(problem.state_box)
     sampling = problem.sampling
+    memory.require(32 * d * sample_points(problem), "sample points")
     if isinstance(sampling, Grid):
         k = sampling.per_axis
         axis = (np.arange(k) + 0.5) / k
@@ -45,6 +49,7 @@ def sample_points(problem: Problem) -> int:
 
 def control_values(problem: Problem) -> list[Floats]:
     """Return the values of every control."""
+    memory.require(16 * max(map(_count, problem.control_grid.values()), default=0), "controls")
     return [
         np.array(axis.values)
         if isinstance(axis, ControlValues)
@@ -55,6 +60,7 @@ def control_values(problem: Problem) -> list[Floats]:
 
 def control_vectors(problem: Problem) -> Floats:
     """Return the control vectors in C order, shape (M, p); (1, 0) for an autonomous system."""
+    memory.require(24 * control_count(problem) * len(problem.control_grid), "control vectors")
     values = control_values(problem)
     if not values:
         return np.zeros((1, 0))
@@ -63,10 +69,23 @@ def control_vectors(problem: Problem) -> Floats:
 
 def control_count(problem: Problem) -> int:
     """Return M without making the control vectors."""
-    return math.prod(
-        len(axis.values) if isinstance(axis, ControlValues) else axis.points
+    return math.prod(map(_count, problem.control_grid.values()))
+
+
+def control_range(problem: Problem) -> tuple[Floats, Floats]:
+    """Return the least and the largest value of every control without making the others."""
+    ends = [
+        (min(axis.values), max(axis.values))
+        if isinstance(axis, ControlValues)
+        else (axis.low, axis.high)
         for axis in problem.control_grid.values()
-    )
+    ]
+    low, high = np.array(ends, dtype=float).reshape(-1, 2).T
+    return low, high
+
+
+def _count(axis: ControlRange | ControlValues) -> int:
+    return len(axis.values) if isinstance(axis, ControlValues) else axis.points
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +118,7 @@ class Nodes:
 
 def noise_nodes(problem: Problem) -> Nodes:
     """Return the noise nodes; nodes of zero weight are dropped."""
+    memory.require(node_count(problem) * NODE, "noise nodes")
     if not problem.noise:
         return Nodes(np.zeros((1, 0)), np.ones(1), np.zeros(1, dtype=np.int64))
     variables = []
@@ -111,18 +131,17 @@ def noise_nodes(problem: Problem) -> Nodes:
         kept = weights > 0
         weights = weights[kept] / math.fsum(weights[kept])
         variables.append((values[kept], weights))
-    products = list(itertools.product(*(range(len(values)) for values, _ in variables)))
-    values = np.array(
-        [[variables[k][0][i] for k, i in enumerate(index)] for index in products], dtype=float
-    )
-    weights = np.array(
-        [math.prod(variables[k][1][i] for k, i in enumerate(index)) for index in products]
-    )
+    grids = np.meshgrid(*(values for values, _ in variables), indexing="ij", copy=False)
+    weights = np.ones(1)
+    for _, each in variables:  # in the order of the variables, as rounding depends on it
+        weights = np.multiply.outer(weights, each).reshape(-1)
     kept = weights > 0
-    values, weights = values[kept], weights[kept]
-    numbers: dict[float, int] = {}
-    group = np.array([numbers.setdefault(float(w), len(numbers)) for w in weights], dtype=np.int64)
-    return Nodes(values, weights, group)
+    values = np.stack([grid.reshape(-1)[kept] for grid in grids], axis=-1)
+    weights = weights[kept]
+    _, first, found = np.unique(weights, return_index=True, return_inverse=True)
+    number = np.empty(len(first), dtype=np.int64)
+    number[np.argsort(first)] = np.arange(len(first))
+    return Nodes(values, weights, number[found])
 
 
 def node_count(problem: Problem) -> int:

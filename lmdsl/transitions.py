@@ -25,6 +25,7 @@ from lmdsl.errors import BadInput
 from lmdsl.merging import merge, tile
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
+from lmdsl.program import Program
 from lmdsl.regions import Regions
 from lmdsl.rows import Rows, Shares, code_type
 from lmdsl.sampler import CHUNK, Block, Sampler
@@ -58,6 +59,11 @@ class Transitions:
     cost: Floats
 
 
+def require_least(problem: Problem) -> None:
+    """Refuse a problem whose grids and cells do not fit, before anything of it is made."""
+    memory.require(estimate(problem), "at least, before sampling")
+
+
 class Pilot(NamedTuple):
     """What a few cells say of all: the share of admissible pairs and the mean length of rows."""
 
@@ -69,10 +75,10 @@ ALL_ADMISSIBLE = Pilot()
 
 
 def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
-    """Return the bytes that compiling and solving a problem takes at its peak.
+    """Return an upper bound of the bytes that compiling and solving a problem takes.
 
-    Solving is counted for the default backend, as it goes as a rule: breaking many ties, or a first
-    policy that is hard to find, take more.
+    Solving is counted for the default backend, as it goes as a rule. What takes more (cells that
+    are lost, ties, other backends, a first policy that is hard to find) asks when it comes to it.
     """
     # Capped: a stranger's product of counts may exceed the range of doubles.
     N = min(math.prod(axis.cells for axis in problem.state_box.values()), 10**40)
@@ -85,12 +91,40 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     copied = (
         pairs * (28 + pilot.entries * entry) if pilot.admissible < 1 else 0
     )  # cells may be lost
-    # Samples and images of every axis, and the intermediate arrays of a formula.
-    blocks = (2 * len(problem.state_box) + 10) * 8 * max(CHUNK, S) * threads.count()
-    # Of a pair whether it ties; of a cell vectors, and the rows of a policy in doubles.
-    solving = pairs + 130 + 24 * pilot.entries
-    grids = M * 8 * (1 + len(problem.control_grid)) + S * (8 * len(problem.state_box) + 200)
-    return int(min(model + max(N * copied + blocks, N * solving) + grids, 1e30))
+    # Of a pair whether it ties, and its cost where gamma > 1; of a cell vectors, and the rows of a
+    # policy in doubles.
+    solving = pairs * (9 if problem.gamma > 1 else 1) + 130 + 24 * pilot.entries
+    peak = MARGIN * (model + max(N * copied + _blocks(problem, S), N * solving))
+    return int(min(peak + _grids(problem, M, S) + OVERHEAD, 1e30))
+
+
+MARGIN = 1.1
+"""A few cells do not say exactly what all are like, and allocators keep something back."""
+
+OVERHEAD = 2**25
+"""Bytes of code, kernels and tables."""
+
+CODE = 250
+"""Bytes of a code of samples with noise: its exact numerator, of up to a thousand bits."""
+
+
+def _blocks(problem: Problem, S: int) -> int:
+    """Return the bytes of the blocks that are sampled at a time."""
+    step, cost = problem.step(), Program([problem.cost()], problem.system.constants())
+    d, samples, count = len(problem.state_box), max(CHUNK, S), threads.count()
+    # States, images and their cells, the arrays of a formula, keys and rows.
+    live = max(getattr(step, "live", 16), cost.live)
+    each = 8 * samples * (3 * d + live + 8)
+    waiting = 8 * (count - 1) * 16 * samples  # finished blocks, for their turn
+    return count * each + waiting
+
+
+def _grids(problem: Problem, M: int, S: int) -> int:
+    """Return the bytes of sample points, controls, noise nodes and codes."""
+    points, nodes = sampling.sample_points(problem), sampling.node_count(problem)
+    codes = S * (CODE if nodes > 1 else 16)
+    controls = M * 8 * (1 + 4 * len(problem.control_grid))
+    return controls + points * 40 * len(problem.state_box) + nodes * sampling.NODE + codes
 
 
 SHORT = 2e9
@@ -113,7 +147,7 @@ def assemble(
         The problem does not fit in memory, or the stage cost of an admissible pair is negative
         or not finite at a sample.
     """
-    memory.require(estimate(problem), "a lower estimate, before sampling")
+    require_least(problem)
     regions = Regions.of(problem, partition)
     deadline = Deadline.of(deadline)
     sampler = Sampler(problem, partition, deadline)
@@ -223,6 +257,7 @@ class _Assembler:
         target = np.empty(index.size, dtype=np.int32)
         code = np.empty(index.size, dtype=np.uint32)
         high, wide = tile(block.cells_last, block.width)
+        high = min(high, len(block.cells))
         key = np.empty((sampler.samples, high * wide), dtype=self.key)
         pairs, entries = merge(
             index, block.cells_last, mean, self.number, self.group, self.bits, self.first_code,

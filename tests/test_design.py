@@ -33,7 +33,8 @@ systems.*
 systems
 declarations
 problem
-sampling memory threads directions deadline axis
+memory threads directions deadline axis
+sampling
 apart linprog
 sweeps
 peeling merging leaps

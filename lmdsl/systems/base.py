@@ -137,6 +137,7 @@ class _RungeKutta:
     def __init__(self, field: Program, states: tuple[str, ...], step: float, substeps: int) -> None:
         self.field, self.states = field, states
         self.substeps, self.h = substeps, step / substeps
+        self.live = field.live + 8 * len(states)
         self.effort, self.work = (
             substeps * (4 * each + 14 * len(states)) for each in (field.effort, field.work)
         )
