@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import threads
+from lmdsl import memory, threads
 from lmdsl.deadline import Deadline
 from lmdsl.kernels import fixed, kernel
 from lmdsl.rows import Rows
@@ -64,6 +64,7 @@ class Predecessors:
     @classmethod
     def of(cls, rows: Rows) -> Predecessors:
         """Transpose the pattern of rows."""
+        memory.require(8 * len(rows.target) + 16 * rows.columns + 8 * rows.count, "predecessors")
         pointer = np.zeros(rows.columns + 2, dtype=np.int64)
         small = rows.count < 2**31
         pair = np.empty(len(rows.target), dtype=np.int32 if small else np.int64)
@@ -214,6 +215,9 @@ def restrict(
     n = int(found.inside.sum())
     if n == rows.columns and found.surviving.all():
         return slice(None), transitions.pair_pointer, rows
+    share = int(found.surviving.sum()) / max(rows.count, 1)
+    row = len(rows.target) / max(rows.count, 1) * (4 + rows.code.itemsize)
+    memory.require(share * rows.count * (28 + row), "the pairs of the stabilizable set")
     kept = np.flatnonzero(found.surviving)
     per_cell = np.add.reduceat(
         np.append(found.surviving, False), transitions.pair_pointer[:-1], dtype=np.int64

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bellman, bounds, graph, leaps, linear
+from lmdsl import bellman, bounds, graph, leaps, linear, memory
 from lmdsl.kernels import kernel
 from lmdsl.linear import Stop as Stop
 from lmdsl.linear import Stopped, never
@@ -299,7 +299,7 @@ def canonical(
 
     Tied are the columns with Q <= Q_min + 1e-12 |Q_min|. Among them take those optimal for unit
     cost weighted with g, then the smallest control index; cells from which that cost is infinite
-    take the smallest tied index.
+    take the smallest tied index. Where there is no memory for that, the policy at hand stays.
 
     Parameters
     ----------
@@ -315,18 +315,24 @@ def canonical(
     ties, first, several = screen.tied(value, TIE, pair)
     if not several:
         return first
-    found = graph.stabilizable(*_columns(lp, ties))
-    if not found.inside.any():
-        return first
-    columns = np.flatnonzero(ties)[found.surviving]
-    inside = np.flatnonzero(found.inside)
-    sub = lp.part(columns, inside)
+    if not memory.fits(_taken_by_ties(lp, int(ties.sum()))):
+        return pair
+    if ties.all():  # the whole model, of which no copy is made
+        sub, start, columns, inside = lp, pair, None, np.arange(lp.n)
+    else:
+        found = graph.stabilizable(*_columns(lp, ties))
+        if not found.inside.any():
+            return first
+        columns = np.flatnonzero(ties)[found.surviving]
+        inside = np.flatnonzero(found.inside)
+        sub = lp.part(columns, inside)
+        start = np.searchsorted(columns, pair[inside])
+        start = np.minimum(start, len(columns) - 1)
+        owned = columns[start] == pair[inside]
+        if not owned.all():
+            start = np.where(owned, start, sub._algorithm_1[1])
+    del ties
     unit = np.ones(sub.K)
-    start = np.searchsorted(columns, pair[inside])
-    start = np.minimum(start, len(columns) - 1)
-    owned = columns[start] == pair[inside]
-    if not owned.all():
-        start = np.where(owned, start, sub._algorithm_1[1])
     w = _even(sub, start, lp.growth, np.ones(sub.n))
     if w is None:
         w = evaluate(sub, start, lp.growth, unit, stop=stop)
@@ -341,14 +347,22 @@ def canonical(
     least = bellman.improve(sub, done.value, lp.growth, unit).value
     equal = bellman.tied(replace(sub, gamma=lp.growth, cost=unit), done.value, least, TIE)
     chosen = first.copy()
-    chosen[inside] = columns[first_column(sub, equal)]
+    column = first_column(sub, equal)
+    chosen[inside] = column if columns is None else columns[column]
     return chosen
+
+
+def _taken_by_ties(lp: StabilizationLP, count: int) -> int:
+    """Return the bytes that breaking ties takes: a model of so many columns, and its costs."""
+    row = len(lp.rows.target) // max(lp.K, 1) + 1
+    copied = 0 if count == lp.K else 60 + row * (8 + lp.rows.code.itemsize)
+    return count * (20 + copied)
 
 
 def first_column(lp: StabilizationLP, allowed: Bools) -> Pairs:
     """Return the first allowed column of every cell (each cell must have one)."""
-    position = np.where(allowed, np.arange(lp.K), lp.K)
-    return np.minimum.reduceat(position, lp.pair_pointer[:-1]).astype(np.int64)
+    columns = np.flatnonzero(allowed)
+    return columns[np.searchsorted(columns, lp.pair_pointer[:-1])]
 
 
 def _columns(lp: StabilizationLP, allowed: Bools):  # type: ignore[no-untyped-def]

@@ -91,9 +91,9 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     copied = (
         pairs * (28 + pilot.entries * entry) if pilot.admissible < 1 else 0
     )  # cells may be lost
-    # Of a pair whether it ties, and its cost where gamma > 1; of a cell vectors, and the rows of a
-    # policy in doubles.
-    solving = pairs * (9 if problem.gamma > 1 else 1) + 130 + 24 * pilot.entries
+    # Of a pair whether it ties, and a unit cost; of a cell vectors, and the rows of a policy in
+    # doubles.
+    solving = pairs * 9 + 130 + 24 * pilot.entries
     peak = MARGIN * (model + max(N * copied + _blocks(problem, S), N * solving))
     return int(min(peak + _grids(problem, M, S) + OVERHEAD, 1e30))
 
@@ -332,6 +332,8 @@ class _Growing:
     def append(self, part: NDArray[Any]) -> None:
         end = self.used + len(part)
         if end > len(self.data):
+            more = int(1.1 * end) - len(self.data)
+            memory.require(more * self.data.itemsize, "rows longer than those of a few cells")
             self.data.resize(int(1.1 * end), refcheck=False)
         self.data[self.used : end] = part
         self.used = end

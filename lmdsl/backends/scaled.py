@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import apart
+from lmdsl import apart, memory
 from lmdsl.backends.base import Options, Solution, Stop
 from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.errors import plain_text
@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from lmdsl.lp import StabilizationLP
 
 Floats = NDArray[np.float64]
+
+
+ENTRY = 100
+"""Bytes of an entry of the matrix: SciPy's while it is made, and the copy of a solver."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +57,16 @@ class ScaledLP:
 
     @classmethod
     def of(cls, lp: StabilizationLP) -> ScaledLP:
-        """Scale the LP with weight ``lp.solve_weight``."""
+        """Scale the LP with weight ``lp.solve_weight``.
+
+        Raises
+        ------
+        MemoryError
+            It does not fit; how much a solver takes beside it is not known.
+        """
+        needed = ENTRY * (len(lp.rows.target) + 2 * lp.K)
+        if not memory.fits(needed):
+            raise MemoryError(f"the linear program needs about {memory.human(needed)}")
         started = time.monotonic()
         weight = lp.solve_weight
         b_unit, c_unit = _unit(weight), _unit(lp.cost)
