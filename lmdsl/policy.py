@@ -356,7 +356,7 @@ def _taken_by_ties(lp: StabilizationLP, count: int) -> int:
     """Return the bytes that breaking ties takes: a model of so many columns, and its costs."""
     row = len(lp.rows.target) // max(lp.K, 1) + 1
     copied = 0 if count == lp.K else 60 + row * (8 + lp.rows.code.itemsize)
-    return count * (20 + copied)
+    return count * (30 + copied)
 
 
 def first_column(lp: StabilizationLP, allowed: Bools) -> Pairs:

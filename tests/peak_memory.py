@@ -1,4 +1,4 @@
-"""Measure in a fresh process what one solve takes: its peak, and what was asked for before."""
+"""Measure in a fresh process the peak of one call, and what was asked for before it was taken."""
 
 from __future__ import annotations
 
@@ -9,13 +9,9 @@ from pathlib import Path
 import lmdsl as lm
 from lmdsl import memory
 
-asked: list[int] = []
 require, fits = memory.require, memory.fits
-
-
-def noted(estimate, what):
-    asked.append(int(estimate))
-    return require(estimate, what)
+data, small, command = json.load(sys.stdin)
+held = [0]  # what was held, and asked for beside it
 
 
 def status(name):
@@ -23,23 +19,24 @@ def status(name):
     return int(line.split()[1]) * 1024
 
 
-def main():
-    data, small, command = json.load(sys.stdin)
-    lm.solve(lm.Problem.model_validate(small))  # imports, kernels
-    problem = lm.Problem.model_validate(data)
-    memory.require = noted
-    Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
-    before = status("VmRSS")
-    found = getattr(lm, command)(problem)
-    print(
-        json.dumps(
-            {
-                "asked": max(asked),
-                "taken": status("VmHWM") - before,
-                "status": getattr(found, "status", ""),
-            }
-        )
-    )
+def require_noted(estimate, what):
+    held.append(status("VmRSS") - before + int(estimate))
+    return require(estimate, what)
 
 
-main()
+def fits_noted(estimate):
+    held.append(status("VmRSS") - before + int(estimate))
+    return fits(estimate)
+
+
+for backend in ("policy-iteration", "highs"):
+    lm.solve(lm.Problem.model_validate(small), backend)  # imports, kernels
+problem = lm.Problem.model_validate(data)
+before = status("VmRSS")
+memory.require, memory.fits = require_noted, fits_noted
+Path("/proc/self/clear_refs").write_text("5")  # forget the peak so far
+try:
+    found = getattr(lm, command)(problem).__repr__()
+except lm.BadInput as error:
+    found = str(error)
+print(json.dumps({"asked": max(held), "taken": status("VmHWM") - before, "found": found}))
