@@ -3,7 +3,8 @@
 A nonlinear solver gets the LP with its derivatives, which are constant: gradient c, Jacobian A, no
 Hessian. On an LP without a solution Mehrotra's multipliers grow without end, and Ipopt has no word
 for it; where they prove that there is none (A'V <= 0 < b'V up to rounding) that is said.
-Standard map, gamma 1.02, 50 x 50 cells, two shared cores: as fast as HiGHS IPX, V good to 1e-9.
+Standard map, gamma 1.02, 50 x 50 cells, two shared cores: about ten times as long as HiGHS IPX, V
+good to 1e-9.
 
 Ipopt's multiplier y of A x = b has the sign of c'x + y'(A x - b): V = -y.
 """
