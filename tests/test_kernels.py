@@ -131,6 +131,7 @@ def test_a_disk_that_takes_no_file(folder, monkeypatch, said, number):
 
 def test_folders_in_order(tmp_path, monkeypatch):
     find = kernels.folders.__wrapped__
+    monkeypatch.setattr(kernels.numba.config, "CACHE_DIR", "")
     own = find()
     assert own[0] == Path(kernels.__file__).parent / "__pycache__"
     assert len(own) == 2
