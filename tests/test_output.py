@@ -126,7 +126,7 @@ def test_text_is_not_disturbed_and_control_characters_are_escaped(tmp_path, nois
 
 
 @posix
-@pytest.mark.parametrize("backend", ["highs", "highs:hipo", "clarabel", "cvxpy", "cvxpy:nobody"])
+@pytest.mark.parametrize("backend", [*backends.installed(), "highs:hipo", "cvxpy:nobody"])
 def test_our_backends_print_nothing(tmp_path, noisy, backend):
     code = f"import lmdsl as lm; lm.solve(lm.load('problem.json'), {backend!r})"
     done = python(tmp_path, noisy, "-c", f"try:\n {code}\nexcept ValueError: pass")
