@@ -221,7 +221,7 @@ PEAKS = {
     "controls": line(4, 10**6),
     "points": line(4, sampling={"kind": "random", "points": 10**6}),
     "arrays": many_arrays(),
-    "density": line(10**6, 1, measure={"density": "exp(sin(x)*cos(x)+x**2)"}),
+    "density": line(600_000, 2, measure={"density": "exp(sin(x)*cos(x)+x**2)"}),
     "noise": {
         **line(4),
         "system": {"kind": "map", "next": {"x": "x - 0.3*u + 0*v*w"}},
