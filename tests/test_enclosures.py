@@ -161,21 +161,21 @@ def hammer(seed, count, points, plain):
 
 
 def test_computed_values_lie_in_the_enclosure():
-    seen, narrow = hammer(0, 2500, 60, plain=False)
-    assert seen > 50_000
-    assert narrow > 300
+    seen, narrow = hammer(0, 1500, 60, plain=False)
+    assert seen > 30_000
+    assert narrow > 200
 
 
 def test_plain_formulas_also_over_the_rationals():
-    seen, narrow = hammer(1, 2500, 60, plain=True)
-    assert seen > 50_000
-    assert narrow > 300
+    seen, narrow = hammer(1, 1500, 60, plain=True)
+    assert seen > 30_000
+    assert narrow > 200
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", range(2, 6))
+@pytest.mark.parametrize("seed", range(2, 4))
 def test_millions_of_computed_values_lie_in_the_enclosure(seed):
-    assert hammer(seed, 10_000, 400, plain=seed % 2 == 1)[0] > 10**6
+    assert hammer(seed, 3000, 800, plain=seed % 2 == 1)[0] > 10**6
 
 
 def wide(rng, low, high, count):
