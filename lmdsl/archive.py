@@ -33,6 +33,7 @@ from lmdsl.sampling import control_count, control_vectors
 from lmdsl.systems import FunctionSystem
 from lmdsl.systems.base import NotStored
 
+SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
 TYPES = {
     "control_index": "<i4",
     "value": "<f8",
@@ -41,6 +42,9 @@ TYPES = {
     "cell_status": "|u1",
     "witness": "<f8",
 }
+FILES = (*folder.NAMES, "figures.png")
+"""What a directory can hold of ours; the figures are written by ``plot``."""
+MODEL = ("pair_pointer", "control", "pointer", "target", "code", "cost")
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> None:
@@ -110,7 +114,7 @@ def _certificate(result: Result) -> dict[str, Any]:
         "gap_before_polish": jsonable(result.gap_before_polish),
         "model_sha256": result.lp.digest if result.lp is not None else result.model_sha256,
         "versions": versions(),
-        "scope": "the finite model (cells and sampled transitions), not the map between samples",
+        "scope": SCOPE,
     }
 
 
@@ -344,7 +348,7 @@ def read_certificate(data: dict[str, Any]) -> dict[str, Any]:
         raise BadInput("seconds needs compile, solve and verify", where)
     bracket = data["gamma_bar"]
     if bracket is not None and not (
-        len(bracket) == 2 and all(x == "inf" or _finite(x) for x in bracket)
+        len(bracket) == 2 and all(x == "inf" or (x is not None and _finite(x)) for x in bracket)
     ):
         raise BadInput("gamma_bar is null or [low, high]", where)
     if not all(isinstance(reason, str) for reason in data["reasons"]):

@@ -193,6 +193,19 @@ def bracket(
     return search.found()
 
 
+def enclosed(lp: StabilizationLP, low: float, high: float) -> tuple[float, float]:
+    """Return a proved bracket of gamma_bar that lies in [low, high], or is as narrow as can be."""
+    if not lp.n:
+        return 0.0, 0.0
+    if exhausted_by_levels(lp) is not None:
+        return math.inf, math.inf
+    search = _Search(lp, never, lp._algorithm_1[1], WIDTH)
+    search.stop = lambda: search.low >= low and search.high <= high
+    with suppress(Stopped):
+        search.run(60)
+    return search.low, search.high
+
+
 class _Search:
     """The bracket while it narrows: both ends, their vectors, and the best policy so far."""
 
@@ -420,8 +433,8 @@ def restricted(lp: StabilizationLP, w: Floats) -> StabilizationLP | None:
         The model on the cells with w = 0; the others get the status BEYOND_GAMMA. None where no
         cell is left, or one is left without a pair.
     """
-    inside = np.flatnonzero(w == 0)
-    beyond = np.append(w > 0, False)
+    inside, out = np.flatnonzero(w == 0), ~(w == 0)  # also where a file says -1 or NaN
+    beyond = np.append(out, False)
     length = np.diff(lp.rows.pointer)
     leads = np.add.reduceat(beyond[lp.rows.target].astype(np.int64), lp.rows.pointer[:-1]) > 0
     columns = np.flatnonzero(~leads & (w[lp.cell] == 0) & (length > 0))
@@ -429,7 +442,7 @@ def restricted(lp: StabilizationLP, w: Floats) -> StabilizationLP | None:
         return None
     smaller = lp.part(columns, inside)
     status = lp.cell_status.copy()
-    status[lp.cells[w > 0]] = CellStatus.BEYOND_GAMMA
+    status[lp.cells[out]] = CellStatus.BEYOND_GAMMA
     total = math.fsum(smaller.weight)
     weight = smaller.weight / total if total > 0 else smaller.weight
     return replace(smaller, cell_status=status, weight=weight)

@@ -67,6 +67,7 @@ stabilize
 facts
 phase_one hints
 explanation
+stored
 comparison verification
 exports.*
 exports

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
 from lmdsl.cli.streams import say
 from lmdsl.errors import printable
+
+AS_STORED = "the result as stored, not re-checked; see lmdsl verify"
 
 
 def add(command: Command) -> None:
@@ -64,8 +67,9 @@ def _simulate(parsed: Arguments) -> int:
         runs = result.simulate(parsed.starts, parsed.steps, parsed.seed, parsed.hold)
     if parsed.json:
         print_json(runs.to_dict())
+        print(f"lmdsl: {AS_STORED}", file=sys.stderr)
         return 0
-    say(runs.text())
+    say(f"{runs.text()}\n({AS_STORED})")
     return 0
 
 
@@ -76,7 +80,7 @@ def _plot(parsed: Arguments) -> int:
     result = Result.load(parsed.dir)
     path = Path(parsed.out) if parsed.out is not None else Path(parsed.dir) / "figures.png"
     plotting.figure(result, path)
-    say(f"written to {printable(str(path))}")
+    say(f"written to {printable(str(path))} ({AS_STORED})")
     return 0
 
 

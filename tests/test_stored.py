@@ -1,0 +1,228 @@
+"""Nothing a result directory says is believed: every field and array is spoiled in turn."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+import math
+
+import numpy as np
+import pytest
+from problems import doubling, made, standard_map, steps
+from test_gamma import corner
+
+import lmdsl as lm
+from lmdsl import arrays, folder
+from lmdsl.cli import main
+from lmdsl.stored import NOT_CLAIMED
+from lmdsl.systems import FunctionSystem
+
+ORBIT = [[0.25, 0.5], [0.75, 0.5]]
+
+
+def function():
+    # The control is the one of least cost, and no other leads to the attractor.
+    return made(steps(cost="1 + x", avoid={"boxes": [{"x": [0.75, 1]}]})).replaced(
+        system=FunctionSystem(next=lambda x, u: (x - 0.25 * u,))
+    )
+
+
+CASES = {
+    "policy": lambda: lm.solve(made(standard_map(8))),
+    "local": lambda: lm.solve(
+        made(standard_map(20, local_controller={"kind": "lqr", "orbit": ORBIT}))
+    ),
+    "refused": lambda: lm.solve(made(doubling(3.0))),
+    "empty": lambda: lm.solve(made({**steps(), "control_grid": {"u": {"values": [0]}}})),
+    "require_all": lambda: lm.solve(made(standard_map(8)), require_all=True),
+    "restricted": lambda: lm.solve(made(corner(2.5)), restrict_to_gamma=True),
+    "function": lambda: lm.solve(function()),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def saved(request, tmp_path_factory):
+    target = tmp_path_factory.mktemp("stored") / request.param
+    CASES[request.param]().save(target)
+    assert lm.verify(target).holds, lm.verify(target).reasons
+    assert lm.verify(target, exact=True).holds
+    return target
+
+
+def put(target, certificate=None, **contents):
+    """Write a directory anew, its digests right."""
+    stored = certificate or json.loads((target / "certificate.json").read_text())
+    for name, held in contents.items():
+        path = target / f"{name}.npz"
+        path.write_bytes(arrays.packed(held))
+        stored["files"][path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    (target / "certificate.json").write_bytes(folder.text(stored))
+
+
+def refused(target):
+    try:
+        return not lm.verify(target).holds
+    except lm.BadInput:
+        return True
+
+
+def others(value):
+    """Other values of the same type, null, and a value where there was null."""
+    if value is None:
+        return [0.5, 0, [1.0, 2.0], "gamma", {}]
+    if isinstance(value, bool):
+        return [not value, None]
+    if isinstance(value, int):
+        return [value + 1, value - 1, None]
+    if isinstance(value, float):
+        return [value * 1.5 + 1e-6, value * 0.5 - 1e-6, -value - 1, None, 1e300]
+    if isinstance(value, str):
+        return [value + "x", ""]
+    if isinstance(value, list):
+        return [[], [*value, "x"], None]
+    return [{}, None]
+
+
+def places(data, path=()):
+    """Every path of JSON data, and the value that stands there."""
+    yield from ([(path, data)] if path else [])
+    items = data.items() if isinstance(data, dict) else enumerate(data)
+    for key, value in items:
+        if isinstance(value, dict | list):
+            yield from places(value, (*path, key))
+        else:
+            yield (*path, key), value
+
+
+# True statements that say less, and are accepted.
+WEAKER = {"gamma_bar", "proved", "measure_residual"}
+
+
+def test_every_field_of_the_certificate(saved):
+    good = json.loads((saved / "certificate.json").read_text())
+    tried = 0
+    for path, value in places(good):
+        if path[0] in NOT_CLAIMED:
+            continue
+        for other in others(value):
+            if other == value and type(other) is type(value):
+                continue
+            spoiled = copy.deepcopy(good)
+            at = spoiled
+            for key in path[:-1]:
+                at = at[key]
+            at[path[-1]] = other
+            (saved / "certificate.json").write_bytes(folder.text(spoiled))
+            tried += 1
+            if refused(saved):
+                continue
+            text = path[0] == "reasons" and good["status"] == "not_stabilizable"  # as message
+            assert text or WEAKER & set(path), (path, value, other)
+    for key in good:
+        if key not in NOT_CLAIMED:
+            less = {k: v for k, v in good.items() if k != key}
+            (saved / "certificate.json").write_bytes(folder.text(less))
+            # What earlier versions did not say may be missing.
+            earlier = ("beyond_gamma", "local_controller", "scope", "coverage", "sure_cells")
+            assert refused(saved) or key in earlier, key
+    (saved / "certificate.json").write_bytes(folder.text(good))
+    assert lm.verify(saved).holds
+    assert tried > 50
+
+
+def test_every_array(saved):
+    good = json.loads((saved / "certificate.json").read_text())
+    with np.load(saved / "solution.npz") as held:
+        arrays_ = dict(held)
+    weight = lm.Result.load(saved).weight
+    for name, array in arrays_.items():
+        for i in range(0, len(array), max(1, len(array) // 16)):
+            for change in (lambda x: x + 1, lambda x: x - 1, lambda x: -x - 1):
+                new = array.copy()
+                with np.errstate(all="ignore"):
+                    new[i] = change(new[i].astype(np.float64))
+                if np.array_equal(new, array):
+                    continue
+                put(saved, copy.deepcopy(good), solution={**arrays_, name: new})
+                if not refused(saved):
+                    # A larger w, or a bound of a cell that no weight and no path touches.
+                    assert name == "witness" or (weight[i] == 0 and name != "cell_status"), (
+                        name,
+                        i,
+                    )
+    put(saved, good, solution=arrays_)
+    assert lm.verify(saved).holds
+
+
+@pytest.mark.parametrize(
+    ("bracket", "holds"),
+    [([1e-5, 1e-4], False), ([2.0001, 3.0], False), ([1.0, 1.9999], False), ([1.0, 2.5], True),
+     ([3.0, 2.0], False), ([-1.0, 3.0], False), ([0.0, "inf"], True), (None, False)],
+)  # fmt: skip
+def test_brackets_of_gamma_bar(tmp_path, bracket, holds):
+    """The truth is 2."""
+    lm.solve(made(doubling(2.5))).save(tmp_path / "out")
+    stored = json.loads((tmp_path / "out" / "certificate.json").read_text())
+    low, high = stored["gamma_bar"]
+    assert low <= 2 <= high
+    put(tmp_path / "out", {**stored, "gamma_bar": bracket})
+    found = lm.verify(tmp_path / "out")
+    assert found.holds == holds
+    assert holds or "gamma_bar" in found.reasons[0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"stage_cost": "2 + x"}, {"stage_cost": "0"}, {"attractor": {"cells": [[1]]}},
+     {"avoid": {"boxes": [{"x": [0.5, 0.75]}]}}, {"gamma": 0.5}, {"avoid": None},
+     {"control_grid": {"u": {"values": [0, 1, 2]}}},
+     {"sampling": {"kind": "grid", "per_axis": 3}}],
+)  # fmt: skip
+def test_the_problem_of_a_function_is_compared(tmp_path, change):
+    target = tmp_path / "out"
+    lm.solve(function()).save(target)
+    data = json.loads((target / "problem.json").read_text())
+    data = {key: value for key, value in {**data, **change}.items() if value is not None}
+    content = folder.text(data)
+    (target / "problem.json").write_bytes(content)
+    stored = json.loads((target / "certificate.json").read_text())
+    stored["files"]["problem.json"] = hashlib.sha256(content).hexdigest()
+    put(target, stored)
+    assert refused(target)
+
+
+@pytest.mark.parametrize("name", ["pair_pointer", "control", "pointer", "target", "code", "cost"])
+def test_the_rows_of_a_function_are_those_of_the_digest(tmp_path, name):
+    target = tmp_path / "out"
+    lm.solve(function()).save(target)
+    with np.load(target / "model.npz") as held:
+        rows = dict(held)
+    for i in range(len(rows[name])):
+        changed = rows[name].copy()
+        changed[i] = changed[i] + 1 if changed[i] == 0 else changed[i] - 1
+        put(target, model={**rows, name: changed})
+        assert refused(target), i
+    put(target, model=rows)
+    assert lm.verify(target).holds
+
+
+def test_a_file_written_anew_is_judged_and_named(tmp_path):
+    target = tmp_path / "out"
+    lm.solve(made(steps())).save(target)
+    with np.load(target / "solution.npz") as held:
+        np.savez(target / "solution.npz", **held)
+    found = lm.verify(target)
+    assert found.holds
+    assert "solution.npz was written anew" in found.notes[0]
+
+
+@pytest.mark.parametrize("form", [[], ["--json"]])
+def test_what_is_not_checked_is_said(tmp_path, capsys, form):
+    lm.solve(made(steps())).save(tmp_path / "out")
+    assert main(["simulate", str(tmp_path / "out"), "--starts", "5", *form]) == 0
+    said = capsys.readouterr()
+    assert "as stored, not re-checked" in (said.err if form else said.out)
+    assert main(["plot", str(tmp_path / "out")]) == 0
+    assert "as stored, not re-checked" in capsys.readouterr().out
+    assert math.isfinite(lm.Result.load(tmp_path / "out").cost)
