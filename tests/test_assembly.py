@@ -93,9 +93,10 @@ def test_rows_count_the_samples_of_each_target_and_group(samples, cells_last, gr
     cost, end = np.empty(pairs), np.empty(pairs, dtype=np.int64)
     target = np.empty(pairs * samples, dtype=np.int32)
     code = np.empty(pairs * samples, dtype=np.uint32)
+    high, wide = tile(cells_last, controls)
     kept, entries = merge(
         np.ascontiguousarray(laid[0]), cells_last, np.ascontiguousarray(laid[1]), number, group,
-        bits, first_code, np.empty((samples, math.prod(tile(cells_last, controls))), dtype=kind),
+        bits, first_code, np.empty((samples, high * wide), dtype=kind), high, wide,
         per_cell, control, cost, end, target, code,
     )  # fmt: skip
     expected = []
@@ -130,7 +131,7 @@ def test_the_network_sorts(length):
 def test_costs_are_averaged_in_the_order_of_the_samples(shape):
     cost, weights = np.random.default_rng(0).random(shape), np.array([0.3, 0.7])
     mean = np.zeros((shape[0], shape[3]))
-    mean_cost(cost, 4, weights, mean)
+    mean_cost(cost, 4, weights, mean, mean.copy())
     total = 0.0
     for sample in np.broadcast_to(cost, (shape[0], 4, 2, shape[3])).transpose(1, 2, 0, 3):
         for weight, g in zip(weights, sample, strict=True):
@@ -143,7 +144,7 @@ def test_a_bad_cost_of_one_sample_spoils_the_mean(bad):
     cost = np.ones((1, 3, 1, 4))
     cost[0, 1, 0, 2] = bad
     mean = np.zeros((1, 4))
-    mean_cost(cost, 3, np.ones(1), mean)
+    mean_cost(cost, 3, np.ones(1), mean, mean.copy())
     assert np.isnan(mean).tolist() == [[False, False, True, False]]
 
 
