@@ -21,7 +21,8 @@ from lmdsl.files import strict_json
 from lmdsl.problem import json_schema, parse_problem
 
 WORDS = {
-    "$defs", "$ref", "$schema", "additionalProperties", "anyOf", "const", "default", "description",
+    "$defs", "$ref", "$schema", "additionalProperties", "allOf",
+    "anyOf", "const", "default", "description",
     "enum", "exclusiveMaximum", "exclusiveMinimum", "items", "maxItems", "maxLength",
     "maxProperties", "maximum", "minItems", "minLength", "minProperties", "minimum", "not", "oneOf",
     "pattern", "prefixItems", "properties", "propertyNames", "required", "title", "type",
