@@ -154,7 +154,7 @@ def _made(target: Path, files: Mapping[str, bytes]) -> bool:
                 return False
             raise
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        _remove(work)
     return True
 
 
@@ -167,7 +167,16 @@ def _tidy_beside(target: Path, start: str) -> None:
             if not found.is_symlink() and set(os.listdir(found)) <= set(NAMES):
                 # Renamed first, so that a save that lives after all finds nothing, not a part.
                 os.rename(found, gone)
-                shutil.rmtree(gone)
+                _remove(gone)
+
+
+def _remove(work: Path) -> None:
+    """Remove a folder, also while others remove it too or a last file appears in it."""
+    for _ in range(TRIES):
+        shutil.rmtree(work, ignore_errors=True)
+        if not os.path.lexists(work):
+            return
+        time.sleep(0.001)
 
 
 @contextlib.contextmanager
