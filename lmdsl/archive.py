@@ -8,6 +8,7 @@ implies.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import sys
 import tempfile
@@ -86,7 +87,7 @@ def _contents(result: Result) -> dict[str, bytes]:
     """Return the files of a result but its certificate."""
     problem, contents = result.problem, {}
     if isinstance(problem.system, FunctionSystem):
-        data = problem.model_dump(mode="json", exclude_none=True)
+        data = _function_problem(problem)
         if result.lp is None:
             raise BadInput(
                 "this result of a Python function was read from a directory, which holds its "
@@ -112,10 +113,28 @@ def _certificate(result: Result) -> dict[str, Any]:
         "reasons": list(proof.reasons),
         "iterations": jsonable(result.iterations),
         "gap_before_polish": jsonable(result.gap_before_polish),
-        "model_sha256": result.lp.digest if result.lp is not None else result.model_sha256,
+        "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
         "versions": versions(),
         "scope": SCOPE,
     }
+
+
+def identity(lp: StabilizationLP) -> str:
+    """Return the digest that a certificate names: that of the compiled model.
+
+    The rows of a Python function cannot be made anew from another problem: its digest is also of
+    all that the problem says, but the name.
+    """
+    if not isinstance(lp.problem.system, FunctionSystem):
+        return lp.digest
+    said = {**_function_problem(lp.problem), "name": "", "model_sha256": lp.digest}
+    return hashlib.sha256(folder.text(said)).hexdigest()
+
+
+def _function_problem(problem: Problem) -> dict[str, Any]:
+    """Return what can be stored of the problem of a Python function."""
+    data: dict[str, Any] = problem.model_dump(mode="json", exclude_none=True)
+    return data
 
 
 def versions() -> dict[str, str]:

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -199,11 +200,20 @@ def enclosed(lp: StabilizationLP, low: float, high: float) -> tuple[float, float
         return 0.0, 0.0
     if exhausted_by_levels(lp) is not None:
         return math.inf, math.inf
-    search = _Search(lp, never, lp._algorithm_1[1], WIDTH)
-    search.stop = lambda: search.low >= low and search.high <= high
-    with suppress(Stopped):
-        search.run(60)
-    return search.low, search.high
+    proved = 0.0, math.inf
+    for width in (WIDTH, LEAST_WIDTH):
+        search = _Search(lp, never, lp._algorithm_1[1], width)
+        search.stop = partial(_inside, search, low, high)
+        with suppress(Stopped):
+            search.run(60)
+        proved = max(proved[0], search.low), min(proved[1], search.high)
+        if proved[0] >= low and proved[1] <= high:
+            break
+    return proved
+
+
+def _inside(search: _Search, low: float, high: float) -> bool:
+    return search.low >= low and search.high <= high
 
 
 class _Search:

@@ -158,6 +158,7 @@ def test_every_array(saved):
 @pytest.mark.parametrize(
     ("bracket", "holds"),
     [([1e-5, 1e-4], False), ([2.0001, 3.0], False), ([1.0, 1.9999], False), ([1.0, 2.5], True),
+     ([2.000003, 2.000004], False), ([1.999996, 1.999997], False),
      ([3.0, 2.0], False), ([-1.0, 3.0], False), ([0.0, "inf"], True), (None, False)],
 )  # fmt: skip
 def test_brackets_of_gamma_bar(tmp_path, bracket, holds):
@@ -170,6 +171,20 @@ def test_brackets_of_gamma_bar(tmp_path, bracket, holds):
     found = lm.verify(tmp_path / "out")
     assert found.holds == holds
     assert holds or "gamma_bar" in found.reasons[0]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"cost": 1e-20}, {"cost": 0.0}, {"lower_bound": 5e-16}, {"measure_residual": -1e-12}],
+)
+@pytest.mark.parametrize("exact", [False, True])
+def test_no_slack_is_large_beside_small_costs(tmp_path, change, exact):
+    result = lm.solve(made(steps(cost="1e-20")))
+    assert result.cost > 1e-20
+    result.save(tmp_path / "out")
+    stored = json.loads((tmp_path / "out" / "certificate.json").read_text())
+    put(tmp_path / "out", {**stored, **change})
+    assert not lm.verify(tmp_path / "out", exact=exact).holds
 
 
 @pytest.mark.parametrize(
@@ -190,6 +205,46 @@ def test_the_problem_of_a_function_is_compared(tmp_path, change):
     stored["files"]["problem.json"] = hashlib.sha256(content).hexdigest()
     put(target, stored)
     assert refused(target)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"state_box": {"x": {"low": 0, "high": 1000, "cells": 4}}},
+     {"state_box": {"y": {"low": 0, "high": 1, "cells": 4}}},
+     {"state_box": {"x": {"low": 0, "high": 1, "cells": 4, "periodic": True}}},
+     {"sampling": {"kind": "random", "points": 2}}, {"on_exit": "clip"},
+     {"control_grid": {"thrust": {"values": [0, 1]}}},
+     {"noise": {"w": {"values": [-5, 5], "weights": [0.5, 0.5]}}},
+     {"noise": {"v": {"values": [-0.01, 0.01], "weights": [0.5, 0.5]}}},
+     {"system": {"kind": "function", "parameters": {"a": 2.0}}}],
+)  # fmt: skip
+@pytest.mark.parametrize("digests", [True, False])
+def test_rows_of_a_function_belong_to_one_problem(tmp_path, change, digests):
+    """Neither set nor cost shows the difference: the rows were made from another problem."""
+    target = tmp_path / "out"
+    data = steps(noise={"w": {"values": [-0.01, 0.01], "weights": [0.5, 0.5]}})
+    system = FunctionSystem(next=lambda x, u, w, a: (x - a * u + w,), parameters={"a": 0.25})
+    lm.solve(made(data).replaced(system=system)).save(target)
+    stored = json.loads((target / "certificate.json").read_text())
+    problem = json.loads((target / "problem.json").read_text())
+    for changed, holds in (({**problem, "name": "renamed"}, True), ({**problem, **change}, False)):
+        content = folder.text(changed) if digests else json.dumps(changed).encode()
+        (target / "problem.json").write_bytes(content)
+        if digests:
+            stored["files"]["problem.json"] = hashlib.sha256(content).hexdigest()
+        put(target, stored)
+        found = lm.verify(target)
+        assert found.holds == holds, found.reasons
+    assert "what the problem says" in found.reasons[0]
+
+
+def test_a_function_saved_by_an_earlier_version_holds(tmp_path):
+    result = lm.solve(function())
+    result.save(tmp_path / "out")
+    stored = json.loads((tmp_path / "out" / "certificate.json").read_text())
+    put(tmp_path / "out", {**stored, "model_sha256": result.lp.digest})
+    found = lm.verify(tmp_path / "out")
+    assert (found.holds, found.same_model) == (True, True)
 
 
 @pytest.mark.parametrize("name", ["pair_pointer", "control", "pointer", "target", "code", "cost"])
