@@ -110,6 +110,7 @@ class Sampler:
         self.work = getattr(step, "work", np.inf) + cost.work
         check = None if deadline is None else partial(deadline.check, doing)
         self.step, self.cost = partial(step, check=check), partial(cost, check=check)
+        self._audit: Audit | None = None
         self._offset = np.ascontiguousarray(self.points.T)[:, :, None]
         self._control = np.ascontiguousarray(self.controls.T)
         self._noise = {
@@ -145,14 +146,18 @@ class Sampler:
         return named
 
     def audit(self, cells: NDArray[np.int64]) -> Audit | None:
-        """Ask a user's function about a few pairs, before all; None for formulas."""
+        """Ask a user's function about a few pairs, before all; None for formulas.
+
+        From then on, of every block some samples are asked for again.
+        """
         step = self.step.func
         if not isinstance(step, FunctionStep) or not len(cells):
             return None
         width = min(len(self.controls), FEW)
         count = max(1, min(len(cells), FEW, CHUNK // (self.samples * width)))
         few = cells[np.linspace(0, len(cells) - 1, count).astype(int)]
-        return step.audit(self.values(Block(0, few, (0, width))))
+        self._audit = step.audit(self.values(Block(0, few, (0, width))))
+        return self._audit
 
     def outcomes(self, block: Block) -> tuple[Floats, Floats]:
         """Return :meth:`images` and :meth:`costs` of a block."""
@@ -173,7 +178,10 @@ class Sampler:
 
     def images(self, block: Block, values: Mapping[str, Floats]) -> Floats:
         """Return the image cells, NaN where a sample leaves, shape (first, S, last)."""
-        index = self.partition.index(self.step(values))
+        images = self.step(values)
+        if self._audit is not None:
+            self._audit.alone(values, images)
+        index = self.partition.index(images)
         first, last = block.shape
         if index.size != self.samples * block.lanes:
             shape = (first, len(self.points), len(self.nodes.weights), last)

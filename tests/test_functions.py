@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import platform
 
 import numpy as np
 import pytest
@@ -210,6 +211,61 @@ def test_a_function_that_changes_in_the_course_of_time_is_named():
 
     with pytest.raises(lm.BadInput, match="keep nothing between calls"):
         lm.compile(problem(ages, data))
+
+
+def large(function, **more):
+    """A problem of several blocks, each far larger than what is asked beforehand."""
+    data = steps(**more)
+    data["state_box"]["x"]["cells"] = 600
+    data["control_grid"] = {"u": {"low": 0, "high": 1, "points": 21}}
+    data["sampling"] = {"kind": "grid", "per_axis": 30}
+    return problem(function, data)
+
+
+def by_shape():
+    kept = {}
+
+    def function(x, u):
+        if x.size <= 500:
+            return [x - 0.25 * u]
+        return [kept.setdefault((x.shape, u.shape), x - 0.25 * u).copy()]
+
+    return function
+
+
+def large_only(change):
+    def function(x, u):
+        image = x - 0.25 * u
+        return [change(image) if image.size > 10_000 else image]
+
+    return function
+
+
+@pytest.mark.parametrize("function", [
+    by_shape(), large_only(lambda y: 0.5 * y), large_only(lambda y: np.sort(y, axis=-1)[..., ::-1]),
+    large_only(lambda y: np.roll(y, 1, axis=1)), large_only(np.zeros_like),
+    large_only(lambda y: np.resize(y.ravel()[:1000], y.shape)),
+])  # fmt: skip
+def test_large_blocks_are_answered_as_small_ones(function):
+    with pytest.raises(lm.BadInput, match=r"among others .* keep nothing between"):
+        lm.compile(large(function))
+
+
+def test_a_function_that_changes_how_doubles_are_rounded_does_not_matter(truth):
+    import ctypes
+
+    try:
+        libm = ctypes.CDLL("libm.so.6")
+    except OSError:
+        pytest.skip("no such library")
+
+    def upward(x, u):
+        image = x - 0.25 * u
+        libm.fesetround(0x800 if platform.machine() == "x86_64" else 0)
+        return [image]
+
+    same(lm.solve(problem(upward)), truth)
+    assert 1.0 + 2.0**-60 == 1.0
 
 
 def test_images_in_the_same_memory_are_refused():

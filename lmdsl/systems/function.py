@@ -14,11 +14,12 @@ from pydantic import Field
 
 from lmdsl.errors import BadInput, shown
 from lmdsl.program import Check
+from lmdsl.surroundings import restore_rounding
 from lmdsl.systems.base import Array, Step, System
 
 WHERE = "system.next"
-ALONE = 8
-"""Samples that are also asked for one by one."""
+ALONE, OF_BLOCK = 8, 4
+"""Samples that are also asked for one by one: before a compilation, and of every block of it."""
 
 REPEATED, APART = 1e-12, 1e-3
 """Differences that are rounding: of the same call twice, and of a sample among others and alone
@@ -80,6 +81,7 @@ class FunctionStep:
         try:
             with np.errstate(all="ignore"):
                 images = self.function(**given, **self.parameters)
+            restore_rounding("the function")
         except BadInput:
             raise
         except ValueError as error:
@@ -139,7 +141,8 @@ class Audit:
                     WHERE,
                 )
         self._compare(tuple(np.array(image, dtype=np.float64) for image in again))
-        self._alone()
+        self._spread = [_spread(image) for image in self.first]
+        self.alone(self.values, self.first, ALONE)
 
     def again(self) -> None:
         """Ask once more."""
@@ -154,39 +157,42 @@ class Audit:
                 k = tuple(int(i) for i in np.argwhere(differs)[0])
                 raise BadInput(
                     f"the function gave {name} = {float(a[k])!r} and later {float(b[k])!r} for "
-                    f"{self._sample(k)}; it must answer the same every time: draw no random "
-                    "numbers (declare noise instead) and keep nothing between calls",
+                    f"{_sample(self.values, k)}; it must answer the same every time: draw no "
+                    "random numbers (declare noise instead) and keep nothing between calls",
                     WHERE,
                 )
 
-    def _alone(self) -> None:
-        """Ask for a few samples one by one."""
-        shape = np.broadcast_shapes(*(array.shape for array in self.values.values()))
-        size = int(np.prod(shape))
-        for flat in np.unique(np.linspace(0, size - 1, min(ALONE, size)).astype(int)):
+    def alone(
+        self, values: Mapping[str, Array], images: Sequence[Array], count: int = OF_BLOCK
+    ) -> None:
+        """Ask for some of the samples that have these images one by one."""
+        shape = np.broadcast_shapes(*(array.shape for array in values.values()))
+        places = np.linspace(0, 1, count) ** 1.3  # both ends, and nothing regular between
+        for flat in np.unique((places * (np.prod(shape) - 1)).astype(int)):
             k = tuple(int(i) for i in np.unravel_index(flat, shape))
             one = {
                 name: np.broadcast_to(array, shape)[k].reshape((1,) * len(shape))
-                for name, array in self.values.items()
+                for name, array in values.items()
             }
-            for name, image, alone in zip(
-                self.step.states, self.first, self.step(one), strict=True
+            for name, image, alone, spread in zip(
+                self.step.states, images, self.step(one), self._spread, strict=True
             ):
                 among = np.broadcast_to(image, shape)[k]
-                if _differ(among, alone.ravel(), APART, _spread(image)).any():
+                if _differ(among, alone.ravel(), APART, spread).any():
                     raise BadInput(
                         f"the function gives {name} = {float(among)!r} for "
-                        f"{self._sample(k)} among others and {float(alone.ravel()[0])!r} for it "
-                        "alone; the image of a sample must not depend on other samples",
+                        f"{_sample(values, k)} among others and {float(alone.ravel()[0])!r} for it "
+                        "alone; the image of a sample must not depend on other samples, and "
+                        "keep nothing between calls",
                         WHERE,
                     )
 
-    def _sample(self, k: tuple[int, ...]) -> str:
-        shape = np.broadcast_shapes(*(array.shape for array in self.values.values()))
-        return ", ".join(
-            f"{name} = {float(np.broadcast_to(array, shape)[k])!r}"
-            for name, array in self.values.items()
-        )
+
+def _sample(values: Mapping[str, Array], k: tuple[int, ...]) -> str:
+    shape = np.broadcast_shapes(*(array.shape for array in values.values()))
+    return ", ".join(
+        f"{name} = {float(np.broadcast_to(array, shape)[k])!r}" for name, array in values.items()
+    )
 
 
 def _image(name: str, image: Any, shape: tuple[int, ...]) -> Any:
