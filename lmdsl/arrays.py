@@ -64,6 +64,8 @@ def unpacked(file: BinaryIO, name: str, expected: Expected) -> dict[str, NDArray
     try:
         with zipfile.ZipFile(cast(BinaryIO, bounded)) as archive:
             bounded.limit = None
+            if len(set(names := archive.namelist())) < len(names):
+                raise BadInput("an array stands twice; keep one")
             for key, (shape, kind) in expected.items():
                 arrays[key] = _member(archive, key, shape, np.dtype(kind))
     except BadInput as error:

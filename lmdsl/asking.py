@@ -86,7 +86,8 @@ def _ask(
 
 def _copies(lp: StabilizationLP, options: Options) -> tuple[StabilizationLP, Options]:
     """Return copies: what a stranger does to them, then or later, happens to nobody else."""
-    own = copy.deepcopy(lp, {id(lp.problem): lp.problem})
+    function = getattr(lp.problem.system, "next", None)  # of Python: the user's, not to be copied
+    own = copy.deepcopy(lp, {id(function): function} if callable(function) else {})
     start, proof = copy.copy(options.start), copy.copy(options.proof)
     freeze(*(array for array in (start, proof) if array is not None))
     return own, replace(options, start=start, proof=proof)

@@ -407,6 +407,63 @@ def test_a_backend_that_unlocks_the_model_spoils_its_own_copy(truth, elimination
     np.testing.assert_array_equal(result.control_index, truth.control_index)
 
 
+def spoil_gamma(problem):
+    vars(problem)["gamma"] = 0.5
+
+
+def spoil_cost(problem):
+    vars(problem)["stage_cost"] = "0*x"
+
+
+def spoil_parameters(problem):
+    dict.__setitem__(problem.system.parameters, "K", 9.0)
+
+
+def spoil_box(problem):
+    vars(problem.state_box["x"])["high"] = 77.0
+
+
+def spoil_axes(problem):
+    dict.pop(problem.state_box, "x")
+
+
+@pytest.mark.parametrize(
+    "spoil", [spoil_gamma, spoil_cost, spoil_parameters, spoil_box, spoil_axes]
+)
+def test_a_backend_that_changes_the_problem_spoils_its_own_copy(truth, spoil, tmp_path):
+    def spoils(lp, options):
+        spoil(lp.problem)
+        return optimal(lp, pair=lp.tree[1])
+
+    problem = made(PROBLEM)
+    lp = lm.compile(problem)
+    result = lm.solve(lp, foreign(spoils))
+    assert problem == made(PROBLEM)
+    assert result.problem is problem
+    assert result.cost == truth.cost
+    result.save(tmp_path / "out")
+    assert lm.verify(tmp_path / "out").holds
+
+
+def test_the_function_of_a_problem_is_not_copied():
+    class Map:
+        def __call__(self, x, u):
+            return [x - 0.25 * u]
+
+        def __deepcopy__(self, memo):
+            raise TypeError("cannot be copied")
+
+    problem = made(steps()).replaced(system=lm.systems.FunctionSystem(next=Map()))
+    seen = []
+
+    def looks(lp, options):
+        seen.append(lp.problem.system.next)
+        return optimal(lp, pair=lp.tree[1])
+
+    assert lm.solve(problem, foreign(looks)).solver_status == "optimal"
+    assert seen == [problem.system.next]
+
+
 def test_a_backend_that_goes_on_in_a_thread_does_not_matter(lp, truth):
     ended = threading.Event()
     threads = []

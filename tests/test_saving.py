@@ -551,6 +551,19 @@ def test_many_members_are_not_listed(tmp_path, results, capsys):
     assert "at most" in capsys.readouterr().err
 
 
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_an_array_that_stands_twice(tmp_path, results, capsys):
+    import zipfile
+
+    target = tmp_path / "out"
+    results[0].save(target)
+    with zipfile.ZipFile(target / "solution.npz", "a") as out:
+        out.writestr("value.npy", out.read("value.npy"))
+        out.comment = b""
+    assert main(["verify", str(target)]) == 2
+    assert "solution.npz: an array stands twice" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("method", ["ZIP_BZIP2", "ZIP_LZMA"])
 def test_methods_that_may_ask_for_gigabytes(tmp_path, results, method, capsys):
     import zipfile
