@@ -168,7 +168,7 @@ def test_names_that_are_not_the_axes_are_refused(columns):
     [0.1, 0.2, 0.3], np.zeros((2, 3)), np.array(["0.1", "0.2"]), np.array([1, 2], "datetime64[s]"),
     np.ma.MaskedArray([0.1, 0.2], [True, False]), [10**400, 0],
     {"x": np.zeros(2), "y": np.zeros(3)},
-], ids=lambda x: ascii(x)[:24])  # fmt: skip
+], ids=lambda x: f"{type(x).__name__} {ascii(x)[:14]}")  # fmt: skip
 def test_what_is_no_state_is_refused(x):
     refused(lambda: PLANE.controller(x))
     refused(lambda: PLANE.closed_loop.path(x, 3))
@@ -280,7 +280,9 @@ def test_arguments_of_another_kind_are_named(bad, tmp_path):
         refused(lambda call=call: call(bad))
 
 
-@pytest.mark.parametrize("bad", [7, None, [1], object(), "a\0b", 1.5], ids=ascii)
+@pytest.mark.parametrize(
+    "bad", [7, None, [1], object(), "a\0b", 1.5], ids=lambda x: type(x).__name__
+)
 def test_paths_of_another_kind_are_named(bad, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for call in (
