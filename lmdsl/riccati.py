@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 STEPS, DOUBLINGS = 200, 64
-ENOUGH, ROUNDING = 1e-13, 1e-6
-"""Relative change of the gain that ends the work, and below which it only has to stop falling."""
+ENOUGH, ROUNDING, FALLING = 1e-13, 1e-6, 0.9
+"""Relative change of the gain that ends the work, and below which it only has to stop falling: near
+a mode that hardly decays Newton halves it."""
 RESIDUAL = 1e-8
 STABLE = 1 - 1e-11
 """Largest modulus of a mode under feedback that rounding in 1 - K leaves digits of."""
@@ -85,7 +86,7 @@ def _newton(A: Floats, B: Floats, Q: Floats, R: Floats) -> Floats | None:
             X = _lyapunov(C, np.diag(Q) + K.T @ (R[:, None] * K))
             last, before, K = change, K, _gain(X, A, B, R)
             change = np.abs(K - before).max() / np.abs(K).max() if K.any() else 0.0
-            if change <= ENOUGH or last / 2 < change <= ROUNDING:
+            if change <= ENOUGH or FALLING * last < change <= ROUNDING:
                 break
         C = A - B @ K
         left = np.diag(Q) + K.T @ (R[:, None] * K) + C.T @ X @ C - X
