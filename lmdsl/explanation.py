@@ -238,7 +238,7 @@ def explain(
     """
     inputs.kind(problem, (Problem, StabilizationLP), "problem", "a Problem or a compiled LP")
     deadline = Deadline.of(time_limit)
-    regions = inputs.whole(regions, "regions")
+    regions, phase_one = inputs.whole(regions, "regions"), inputs.flag(phase_one, "phase_one")
     assembled = None
     if isinstance(problem, StabilizationLP):
         partition, status = problem.partition, problem.cell_status.copy()

@@ -36,6 +36,13 @@ def whole(value: Any, where: str, least: int = 1, most: float = MOST) -> int:
     return number
 
 
+def flag(value: Any, where: str) -> bool:
+    """Return True or False; text, numbers and arrays are neither."""
+    if not isinstance(value, bool | np.bool_):
+        raise BadInput(f"{shown(value)} is neither True nor False", where)
+    return bool(value)
+
+
 def seed(value: Any, where: str = "seed") -> int:
     """Return a seed of a random generator."""
     return whole(value, where, 0, 2**63 - 1)

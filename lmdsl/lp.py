@@ -326,6 +326,9 @@ def compile(  # noqa: A001
         gamma=problem.gamma,
         weight=regions.weight(cells),
     )
+    for array in (lp.controls, lp.control, lp.cost):  # views
+        if isinstance(array.base, np.ndarray):
+            freeze(array.base)
     # The search that found C ends with Algorithm 1 on the surviving pairs.
     pair = found.pair[found.inside]
     column = pair if isinstance(kept, slice) else np.searchsorted(kept, pair)

@@ -110,7 +110,16 @@ class Partition(Frozen):
         clip
             Saturate finite images into the box; default: as the problem's ``on_exit`` says.
         """
-        index = self.index(self._by_axis(images), clip)
+        images = [
+            x if type(x) is np.ndarray and x.dtype == np.float64 else inputs.real(x, "images")
+            for x in self._by_axis(images)
+        ]
+        clip = None if clip is None else inputs.flag(clip, "clip")
+        try:
+            index = self.index(images, clip)
+        except ValueError:
+            shapes = ", ".join(str(x.shape) for x in images)
+            raise BadInput(f"the axes have different shapes: {shapes}", "images") from None
         return np.where(index >= 0, index, -1.0).astype(np.int64)
 
     def _by_axis(self, images: Sequence[Floats]) -> Sequence[Floats]:

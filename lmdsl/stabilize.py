@@ -84,6 +84,8 @@ def solve(
         The problem or an option cannot be used.
     """
     _check_options(problem, tolerance, max_iterations)
+    require_all = inputs.flag(require_all, "require_all")
+    restrict_to_gamma = inputs.flag(restrict_to_gamma, "restrict_to_gamma")
     late = Deadline.of(time_limit)
     chosen, algorithm = backends.resolve(backend)
     started = time.perf_counter()

@@ -102,7 +102,7 @@ def verify(
     BadInput
         The directory cannot be read.
     """
-    judge = check_exactly if exact else check
+    judge = check_exactly if inputs.flag(exact, "exact") else check
     path = inputs.path(path)
     held = archive.read(path)
     result, reasons = held.result, list[str]()

@@ -218,6 +218,33 @@ def test_points_in_rows_are_located_or_named():
     assert line.locate(np.array([[0.9]])).tolist() == [3]
 
 
+@pytest.mark.parametrize("bad", [["a", "b"], [1j, 0], [None, 0], [BIG, 0], [True, False],
+                                 [np.ones(3), np.ones(4)], [[0.1], ["x"]]], ids=ascii)  # fmt: skip
+def test_what_is_no_image_is_not_located(bad):
+    refused(lambda: RESULT.partition.locate(bad), "images")
+
+
+def test_images_of_any_real_kind_are_located():
+    for kind in (np.float32, ">f8", np.longdouble, np.float16):
+        x = np.array([0.25, 0.75], kind)
+        assert PLANE.partition.locate([x, 0.5]).tolist() == [25, 75]
+    x = np.array([0.25, 0.75])
+    x.setflags(write=False)
+    assert PLANE.partition.locate([x[::-1], np.broadcast_to(0.5, 2)]).shape == (2,)
+
+
+@pytest.mark.parametrize("bad", ["no", "true", 0, 1, 1.0, None, np.array([True, False])], ids=ascii)
+def test_flags_are_true_or_false(bad, tmp_path):
+    problem = made(steps())
+    refused(lambda: lm.solve(problem, require_all=bad), "require_all")
+    refused(lambda: lm.solve(problem, restrict_to_gamma=bad), "restrict_to_gamma")
+    refused(lambda: lm.explain(problem, phase_one=bad), "phase_one")
+    refused(lambda: lm.verify(tmp_path, exact=bad), "exact")
+    if bad is not None:
+        refused(lambda: PLANE.partition.locate([0.1, 0.1], clip=bad), "clip")
+    assert lm.solve(problem, require_all=np.True_).verified
+
+
 @pytest.mark.parametrize("bad", [-1, 4, BIG, 1.5, "a", None, [1.5], [[0, 1]], [-1], [4], [BIG],
                                  ["a"], [True], {}], ids=ascii)  # fmt: skip
 def test_cells_are_indices_in_range(bad):

@@ -115,6 +115,16 @@ def test_what_is_derived_is_read_only_too():
             array[...] = 0
 
 
+def test_what_the_arrays_of_a_model_are_views_of_is_read_only_too():
+    lp = lm.solve(made(steps())).lp
+    for field in dataclasses.fields(lp):
+        for array in arrays(getattr(lp, field.name)):
+            base = array.base
+            while isinstance(base, np.ndarray):
+                assert not base.flags.writeable, field.name
+                base = base.base
+
+
 def test_a_loaded_result_is_the_saved_one(tmp_path):
     result = lm.solve(made(steps()))
     result.save(tmp_path / "out")
