@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lmdsl import inputs, memory
-from lmdsl.deadline import Deadline
+from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.errors import BadInput, shown
 from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus
@@ -208,8 +209,16 @@ class ClosedLoop:
         self.nodes = noise_nodes(problem)
         self.probability = self.nodes.weights / self.nodes.weights.sum()
 
-    def step(self, x: Floats, cell: Indices, rng: np.random.Generator) -> tuple[Floats, Indices]:
-        """Return the next states, shape (r, d), and their cells, -1 outside the box."""
+    def step(
+        self, x: Floats, cell: Indices, rng: np.random.Generator, late: Deadline = FOREVER
+    ) -> tuple[Floats, Indices]:
+        """Return the next states, shape (r, d), and their cells, -1 outside the box.
+
+        Raises
+        ------
+        TimeLimitReached
+            The deadline has passed.
+        """
         u = self.controller.at(cell, x)
         values = {name: x[:, k] for k, name in enumerate(self.problem.states)}
         values |= {name: u[:, k] for k, name in enumerate(self.problem.controls)}
@@ -217,7 +226,8 @@ class ClosedLoop:
             node = rng.choice(len(self.probability), size=len(x), p=self.probability)
             noise = self.nodes.values[node]
             values |= {name: noise[:, k] for k, name in enumerate(self.problem.noises)}
-        images = [np.broadcast_to(image, len(x)) for image in self.map(values)]
+        check = partial(late.check, "simulating")
+        images = [np.broadcast_to(image, len(x)) for image in self.map(values, check)]
         return self.enter(np.stack(images, axis=-1))
 
     def enter(self, x: Floats) -> tuple[Floats, Indices]:
@@ -254,10 +264,13 @@ class ClosedLoop:
                     arrived.append(x[ended])
             on = state == CellStatus.STABILIZED
             active, x, cell = active[on], x[on], cell[on]
+            taken[active] = n
             if n == steps or not len(active) or late():
-                taken[active] = n
                 break
-            x, cell = self.step(x, cell, rng)
+            try:
+                x, cell = self.step(x, cell, rng, late)
+            except TimeLimitReached:
+                break
         return outcome, taken, np.concatenate(arrived)
 
     def hold(
@@ -270,10 +283,11 @@ class ClosedLoop:
         (x, cell), runs = self.enter(x), len(x)
         stayed = np.ones(runs, dtype=np.bool_)
         for n in range(steps):
-            if late():
+            try:
+                x, cell = self.step(x, cell, rng, late)
+            except TimeLimitReached:
                 steps = n
                 break
-            x, cell = self.step(x, cell, rng)
             state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
             on = state <= CellStatus.STABILIZED
             stayed = (stayed & (state == CellStatus.ATTRACTOR))[on]
@@ -344,7 +358,9 @@ def simulate(
     late
         When to stop: the runs that have not ended by then count as cycling.
     """
-    memory.require(starts * (100 * loop.partition.dimension + 100), "runs")
+    # States, images and their cells, controls, noise, and the arrays of the formulas.
+    wide = loop.partition.dimension + len(loop.problem.controls) + len(loop.problem.noises)
+    memory.require(8 * starts * (16 * wide + 12 + getattr(loop.map, "live", 16)), "runs")
     rng = np.random.default_rng(seed)
     if not len(cells) or not weight.any():
         raise BadInput("there is no stabilizable cell to start from")

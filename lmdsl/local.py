@@ -11,12 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import riccati
+from lmdsl.deadline import Deadline
 from lmdsl.declarations import ConstantControl, LinearFeedback, LqrFeedback
 from lmdsl.errors import BadInput
 from lmdsl.frozen import Frozen
@@ -24,12 +26,14 @@ from lmdsl.intervals import Interval
 from lmdsl.jets import Jet
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
+from lmdsl.program import Check
 from lmdsl.sampling import Nodes, control_range, noise_nodes
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 MAX_RICCATI = 256  # states of the Riccati equation: orbit points times axes
+PART = 2**12  # states compared with all points of an orbit at a time
 ON_ORBIT = 1e-3  # cell widths by which a point may miss its successor
 
 
@@ -70,12 +74,18 @@ class LocalController(Frozen):
 
     @classmethod
     def of(
-        cls, problem: Problem, partition: Partition, attractor: NDArray[np.bool_]
+        cls,
+        problem: Problem,
+        partition: Partition,
+        attractor: NDArray[np.bool_],
+        deadline: Deadline | None = None,
     ) -> LocalController | None:
         """Return the local controller of a problem, None where it names none.
 
         Raises
         ------
+        TimeLimitReached
+            The deadline has passed.
         BadInput
             The points are no orbit, lie outside the attractor, a control lies outside its range,
             or the Riccati equation has no stabilizing solution.
@@ -105,9 +115,11 @@ class LocalController(Frozen):
         _within(control, low, high, problem.controls, where)
         _inside(orbit, partition, attractor)
         mean = _mean_noise(noise_nodes(problem))
-        _refuse_unless_orbit(problem, partition, orbit, control, mean)
+        check = partial(Deadline.of(deadline).check, "linearising along the orbit")
+        _refuse_unless_orbit(problem, partition, orbit, control, mean, check)
         width, reach = partition.width, _reach(low, high, control)
-        jacobian = _jacobian(problem, orbit, control, mean, np.concatenate([width, reach]))
+        unit = np.concatenate([width, reach])
+        jacobian = _jacobian(problem, orbit, control, mean, unit, check)
         A, B = jacobian[:, :, :d], jacobian[:, :, d:]
         smooth = bool(np.isfinite(jacobian).all())
         if isinstance(declared, LinearFeedback):
@@ -132,9 +144,13 @@ class LocalController(Frozen):
         """Return the index of the orbit point nearest to the centre of each cell."""
         if len(self.orbit) == 1:
             return np.zeros(len(cell), dtype=np.int64)
-        away = self.deviation(self.partition.centres(cell)[:, None, :], self.orbit[None, :, :])
-        far = sum((away[..., i] / h) ** 2 for i, h in enumerate(self.partition.width))
-        nearest: Indices = np.argmin(far, axis=-1)
+        nearest = np.empty(len(cell), dtype=np.int64)
+        for start in range(0, len(cell), PART):
+            some = slice(start, start + PART)
+            centres = self.partition.centres(cell[some])
+            away = self.deviation(centres[:, None, :], self.orbit[None, :, :])
+            far: Any = sum((away[..., i] / h) ** 2 for i, h in enumerate(self.partition.width))
+            nearest[some] = np.argmin(far, axis=-1)
         return nearest
 
     def deviation(self, x: Floats, point: Floats) -> Floats:
@@ -180,8 +196,12 @@ class LocalController(Frozen):
 
     def distance(self, x: Floats) -> Floats:
         """Return the distance from the orbit in cell widths (largest axis), shape (r,)."""
-        away = self.deviation(x[:, None, :], self.orbit[None, :, :])
-        return np.asarray(np.abs(away / self.partition.width).max(axis=-1).min(axis=-1))
+        distance = np.empty(len(x))
+        for start in range(0, len(x), PART):
+            some = slice(start, start + PART)
+            away = self.deviation(x[some, None, :], self.orbit[None, :, :])
+            distance[some] = np.abs(away / self.partition.width).max(axis=-1).min(axis=-1)
+        return distance
 
 
 def _within(control: Floats, low: Floats, high: Floats, names: tuple[str, ...], where: str) -> None:
@@ -209,13 +229,18 @@ def _mean_noise(nodes: Nodes) -> Floats:
 
 
 def _refuse_unless_orbit(
-    problem: Problem, partition: Partition, orbit: Floats, control: Floats, noise: Floats
+    problem: Problem,
+    partition: Partition,
+    orbit: Floats,
+    control: Floats,
+    noise: Floats,
+    check: Check,
 ) -> None:
     q = len(orbit)
     values = {name: orbit[:, k] for k, name in enumerate(problem.states)}
     values |= {name: control[:, j] for j, name in enumerate(problem.controls)}
     values |= {name: np.full(q, noise[j]) for j, name in enumerate(problem.noises)}
-    images = np.stack([np.broadcast_to(y, q) for y in problem.step()(values)], axis=-1)
+    images = np.stack([np.broadcast_to(y, q) for y in problem.step()(values, check)], axis=-1)
     miss = images - np.roll(orbit, -1, axis=0)
     span = partition.high - partition.low
     with np.errstate(invalid="ignore"):
@@ -238,7 +263,12 @@ def _reach(low: Floats, high: Floats, control: Floats) -> Floats:
 
 
 def _jacobian(
-    problem: Problem, orbit: Floats, control: Floats, noise: Floats, unit: Floats
+    problem: Problem,
+    orbit: Floats,
+    control: Floats,
+    noise: Floats,
+    unit: Floats,
+    check: Check,
 ) -> Floats:
     """Return the derivatives by states and controls, shape (q, d, d + p); NaN at a kink.
 
@@ -256,7 +286,7 @@ def _jacobian(
     jets |= {name: Jet.constant(x, len(names)) for name, x in fixed.items()}
     slopes = []
     with np.errstate(invalid="ignore", over="ignore"):
-        for image, own in zip(step.enclose(jets), unit, strict=False):
+        for image, own in zip(step.enclose(jets, check), unit, strict=False):
             per = (unit / own)[:, None]
             low, high = (per * np.broadcast_to(end, (len(names), q)) for end in image.slope)
             sharp = np.isfinite(low) & (high - low <= 1e-6 * (1 + np.abs(low)))

@@ -20,7 +20,7 @@ from lmdsl.jets import Jet, apply, enclosure
 from lmdsl.local import LocalController
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.program import FUNCTION
+from lmdsl.program import FUNCTION, Check
 from lmdsl.sampling import noise_nodes
 
 Floats = NDArray[np.float64]
@@ -199,7 +199,7 @@ def _kept(
     A box whose image is not enclosed in A is halved along its longest side (in cell widths),
     unless its centre is mapped outside: then its cell is lost.
     """
-    step, partition = problem.step(), local.partition
+    step, partition, check = problem.step(), local.partition, partial(deadline.check, DOING)
     (low, high, home), work = partition.domain(cells), 0.0
     lost = np.zeros(len(cells), dtype=np.bool_)
     for _ in range(ROUNDS * partition.dimension):
@@ -209,8 +209,8 @@ def _kept(
         inside = np.ones(len(home), dtype=np.bool_)
         with np.errstate(all="ignore"):
             for node in nodes:
-                deadline.check(DOING)
-                images = _images(problem, local, step, cells[home], low, high, node)
+                check()
+                images = _images(problem, local, step, cells[home], low, high, node, check)
                 inside &= _into(partition, local.attractor, images)
         centre = low / 2 + high / 2
         lost[home[~_stays(problem, local, centre, cells[home], nodes, deadline)]] = True
@@ -234,18 +234,25 @@ def _images(
     low: Floats,
     high: Floats,
     noise: Floats,
+    check: Check,
 ) -> list[Interval]:
     """Enclose T(x, C0(x), w) on boxes."""
     centre = Interval.point(low / 2 + high / 2)
     away = subtract(Interval(low, high), centre)
     steps = [Interval(*(end[:, k] for end in away)) for k in range(local.partition.dimension)]
-    images = _closed(problem, local, step, cell, Interval(low, high), noise)
-    middle = _closed(problem, local, step, cell, centre, noise)
+    images = _closed(problem, local, step, cell, Interval(low, high), noise, check)
+    middle = _closed(problem, local, step, cell, centre, noise, check)
     return [enclosure(image, at, steps) for image, at in zip(images, middle, strict=True)]
 
 
 def _closed(
-    problem: Problem, local: LocalController, step: Any, cell: Indices, box: Interval, noise: Floats
+    problem: Problem,
+    local: LocalController,
+    step: Any,
+    cell: Indices,
+    box: Interval,
+    noise: Floats,
+    check: Check,
 ) -> tuple[Jet, ...]:
     """Return jets of the closed loop, derivatives with respect to the states."""
     d = local.partition.dimension
@@ -258,7 +265,7 @@ def _closed(
     values = dict(zip((*problem.states, *problem.controls), (*x, *u), strict=True))
     for j, name in enumerate(problem.noises):
         values[name] = Jet.constant(noise[j], d)
-    images: tuple[Jet, ...] = step.enclose(values)
+    images: tuple[Jet, ...] = step.enclose(values, check)
     return images
 
 

@@ -30,7 +30,7 @@ from lmdsl.regions import Regions
 from lmdsl.rows import Rows
 from lmdsl.sampling import control_vectors
 from lmdsl.surroundings import own_arithmetic
-from lmdsl.transitions import Progress, assemble, require_least
+from lmdsl.transitions import Progress, assemble, require_least, unless_short
 
 Floats = NDArray[np.float64]
 
@@ -303,8 +303,10 @@ def compile(  # noqa: A001
     inputs.kind(problem, Problem, "problem", "a Problem")
     partition = Partition.of(problem)
     require_least(problem)
+    patient = unless_short(problem, deadline)
     if problem.local_controller is not None:  # refuse a wrong one before the work
-        LocalController.of(problem, partition, Regions.of(problem, partition).attractor)
+        attractor = Regions.of(problem, partition, patient).attractor
+        LocalController.of(problem, partition, attractor, patient)
     transitions = assemble(problem, partition, progress, deadline)
     regions = transitions.regions
     found = graph.stabilizable(transitions.pair_pointer, transitions.rows, deadline)

@@ -6,10 +6,15 @@ samples alike (sorting, summing the cost) run on vectors of pairs.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from lmdsl.kernels import kernel
 from lmdsl.sweeps import ONE
+
+Array = NDArray[Any]
 
 
 @kernel
@@ -74,6 +79,31 @@ def merge(  # type: ignore[no-untyped-def]
                         pairs += ONE
                     k += ONE
     return pairs, entries
+
+
+def merge_one(
+    index: Array, number: Array, group: Array, bits: int, first_code: Array
+) -> tuple[Array, Array]:
+    """Return the targets and codes of one pair of many samples, none where one leaves.
+
+    The same as by :func:`merge`, sorted by NumPy: fewer comparisons, and no long call of native
+    code that nothing can end. Parameters as there, ``group`` of the type of keys.
+    """
+    image = index.reshape(-1)
+    inside = image >= 0.0
+    if not inside.all():
+        return number[:0], first_code[:0]
+    target = number[image.astype(np.int64)]
+    if target.min() < 0:
+        return target[:0], first_code[:0]
+    key = target.astype(group.dtype)
+    key <<= bits
+    key |= group
+    key.sort()
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    samples = np.diff(first, append=len(key))
+    distinct = key[first]
+    return distinct >> bits, first_code[distinct & ((1 << bits) - 1)] + samples - 1
 
 
 def tile(cells_last: bool, controls: int) -> tuple[int, int]:

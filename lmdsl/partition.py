@@ -222,10 +222,18 @@ class Partition(Frozen):
             for k, index in enumerate(self.multi_index(cell))
         ]
 
-    def mask(self, blocks: Iterable[tuple[Indices | range, ...]]) -> Bools:
-        """Return which cells lie in a union of blocks (on each axis a range, or an index array)."""
+    def mask(
+        self,
+        blocks: Iterable[tuple[Indices | range, ...]],
+        check: Callable[[], object] = lambda: None,
+    ) -> Bools:
+        """Return which cells lie in a union of blocks (on each axis a range, or an index array).
+
+        ``check`` is called before every block; it may raise.
+        """
         inside = np.zeros(self.shape, dtype=np.bool_)
         for block in blocks:
+            check()
             spans = [slice(a.start, a.stop) for a in block if isinstance(a, range)]
             inside[tuple(spans) if len(spans) == len(block) else np.ix_(*block)] = True
         return inside.ravel()

@@ -5,15 +5,17 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import memory
+from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.program import Program
+from lmdsl.program import Check, Program
 
 CELL = 32
 """Bytes of a cell while the sets are made."""
@@ -54,28 +56,34 @@ class Regions:
         return mass / total if total > 0 else np.zeros(len(cells))
 
     @classmethod
-    def of(cls, problem: Problem, partition: Partition) -> Regions:
+    def of(
+        cls, problem: Problem, partition: Partition, deadline: Deadline | None = None
+    ) -> Regions:
         """Resolve the attractor, avoid and measure of a problem.
 
         Raises
         ------
+        TimeLimitReached
+            The deadline has passed.
         BadInput
             A point or index lies outside the box, a set has no cell, or a cell is both
             attractor and avoid.
         """
         memory.require(CELL * partition.size, "the sets of cells")
-        attractor = _attractor(problem, partition)
+        check = partial(Deadline.of(deadline).check, "compiling")
+        attractor = _attractor(problem, partition, check)
         avoid = np.zeros(partition.size, dtype=np.bool_)
         if problem.avoid:
-            avoid = partition.mask(
+            boxes = (
                 partition.overlapping_box(box, f"avoid.boxes[{i}]")
                 for i, box in enumerate(problem.avoid.boxes)
             )
+            avoid = partition.mask(boxes, check)
         both = np.flatnonzero(attractor & avoid)
         if len(both):
             index = [int(k) for k in np.unravel_index(both[0], partition.shape)]
             raise BadInput(f"cell {index} is both attractor and avoid; shrink one of them", "avoid")
-        mass = _mass(problem, partition)
+        mass = _mass(problem, partition, check)
         free = np.flatnonzero(~attractor & ~avoid)
         number = np.full(partition.size, -1, dtype=np.int32)
         number[free] = np.arange(len(free), dtype=np.int32)
@@ -83,7 +91,7 @@ class Regions:
         return cls(attractor, avoid, mass, free, number)
 
 
-def _mass(problem: Problem, partition: Partition) -> NDArray[np.float64]:
+def _mass(problem: Problem, partition: Partition, check: Check) -> NDArray[np.float64]:
     mass = np.ones(partition.size)
     measure = problem.measure
     if measure is None:
@@ -101,7 +109,7 @@ def _mass(problem: Problem, partition: Partition) -> NDArray[np.float64]:
         for start in range(0, partition.size, PART):
             some = np.arange(start, min(start + PART, partition.size))
             centres = partition.centres(some)
-            mass[some] = program(dict(zip(partition.names, centres.T, strict=True)))[0]
+            mass[some] = program(dict(zip(partition.names, centres.T, strict=True)), check)[0]
         bad = np.flatnonzero(~((mass >= 0) & np.isfinite(mass)))
         if len(bad):
             index = [int(k) for k in np.unravel_index(bad[0], partition.shape)]
@@ -111,9 +119,10 @@ def _mass(problem: Problem, partition: Partition) -> NDArray[np.float64]:
                 "measure.density",
             )
     if measure.boxes is not None:
-        inside = partition.mask(
+        boxes = (
             partition.inside_box(box, f"measure.boxes[{i}]") for i, box in enumerate(measure.boxes)
         )
+        inside = partition.mask(boxes, check)
         if not inside.any():
             raise BadInput("no cell lies inside the boxes; enlarge them", "measure.boxes")
         mass[~inside] = 0.0
@@ -122,7 +131,7 @@ def _mass(problem: Problem, partition: Partition) -> NDArray[np.float64]:
     return mass
 
 
-def _attractor(problem: Problem, partition: Partition) -> NDArray[np.bool_]:
+def _attractor(problem: Problem, partition: Partition, check: Check) -> NDArray[np.bool_]:
     declared = problem.attractor
     points = (
         partition.around_point(
@@ -143,7 +152,7 @@ def _attractor(problem: Problem, partition: Partition) -> NDArray[np.bool_]:
                     f"{partition.names[k]}",
                     f"attractor.cells[{i}]",
                 )
-    mask = partition.mask(itertools.chain(points, boxes, cells))  # one at a time
+    mask = partition.mask(itertools.chain(points, boxes, cells), check)  # one at a time
     if not mask.any():
         raise BadInput("no cell lies inside the boxes; enlarge them or give points", "attractor")
     return mask

@@ -87,8 +87,8 @@ class Sampler:
         Number of samples S of a pair; sample s is point ``s // nodes`` and node ``s % nodes``.
     controls
         Control vectors, shape (M, p).
-    work
-        Additions that take as long as a sample; infinite for a Python function.
+    check
+        Raises once the deadline has passed.
     step, cost
         Map and stage cost of named arrays; they raise once the deadline has passed.
     """
@@ -107,8 +107,7 @@ class Sampler:
         self.samples = len(self.points) * len(self.nodes.weights)
         step, cost = _step(problem), Program([problem.cost()], problem.system.constants())
         self._images, self._costs = _split(problem, step, cost)
-        self.work = getattr(step, "work", np.inf) + cost.work
-        check = None if deadline is None else partial(deadline.check, doing)
+        self.check = check = partial(Deadline.of(deadline).check, doing)
         self.step, self.cost = partial(step, check=check), partial(cost, check=check)
         self._audit: Audit | None = None
         self._offset = np.ascontiguousarray(self.points.T)[:, :, None]

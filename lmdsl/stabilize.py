@@ -100,6 +100,7 @@ def solve(
         lp = problem
     job = _Job(lp, chosen, tolerance, compiled, backend if isinstance(backend, str) else None)
     refused = _not_stabilizable(lp, require_all)
+    job.finish = late.again()
     if refused:
         return job.refused(*refused)
     started = time.perf_counter()
@@ -121,7 +122,7 @@ def solve(
                     progress=progress,
                 )
                 return job.restricted(inner, lp.expand(w, 0.0, 0.0))
-            job.solve_seconds = time.perf_counter() - started
+            job.solve_seconds, job.finish = time.perf_counter() - started, late.again()
             limits = gamma.bracket(lp, late)
             bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
             message = gamma.refusal_message(lp, w, limits, bracket)

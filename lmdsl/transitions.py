@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from lmdsl import memory, sampling, threads
 from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput
-from lmdsl.merging import merge, tile
+from lmdsl.merging import merge, merge_one, tile
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.program import Program
@@ -130,6 +130,39 @@ def _grids(problem: Problem, M: int, S: int) -> int:
 SHORT = 2e9
 """Additions up to which compiling takes a moment, and is not ended for the time it takes."""
 
+MANY = CHUNK // 2
+"""Samples from which those of a pair are sorted by themselves."""
+
+SAMPLE = 40
+"""Additions that take as long as locating and sorting a sample."""
+
+CALL = 2_000
+"""Additions that take as long as NumPy's own work for an operation on an array."""
+
+SET = 20_000
+"""Additions that take as long as resolving a point or a box of a set, its cells apart."""
+
+
+def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
+    """Return a deadline, or one that never passes where compiling takes a moment at most."""
+    N = math.prod(axis.cells for axis in problem.state_box.values())
+    lanes = N * sampling.control_count(problem)
+    samples = sampling.sample_points(problem) * sampling.node_count(problem)
+    step, cost = problem.step(), Program([problem.cost()], problem.system.constants())
+    calls = 2 + 2 * lanes * min(samples, CHUNK) // CHUNK
+    work = lanes * samples * (SAMPLE + getattr(step, "work", math.inf) + cost.work)
+    work += CALL * calls * (getattr(step, "effort", math.inf) + cost.effort)
+    attractor, avoid, measure = problem.attractor, problem.avoid, problem.measure
+    boxes = [attractor.boxes, avoid.boxes if avoid else (), (measure and measure.boxes) or ()]
+    count = sum(map(len, boxes))
+    work += N * count + SET * (count + len(attractor.points) + len(attractor.cells))
+    density = problem.density()
+    if density is not None:
+        work += N * Program([density], problem.system.constants()).work
+    if problem.local_controller is not None:  # linearised: some fifty operations for each
+        work += 50 * CALL * getattr(step, "effort", math.inf)
+    return Deadline() if work <= SHORT else deadline
+
 
 def assemble(
     problem: Problem,
@@ -148,13 +181,9 @@ def assemble(
         or not finite at a sample.
     """
     require_least(problem)
-    regions = Regions.of(problem, partition)
-    deadline = Deadline.of(deadline)
+    deadline = unless_short(problem, Deadline.of(deadline))
+    regions = Regions.of(problem, partition, deadline)
     sampler = Sampler(problem, partition, deadline)
-    F, M = len(regions.free), len(sampler.controls)
-    if F * M * sampler.samples * sampler.work <= SHORT:
-        deadline = Deadline()
-        sampler = Sampler(problem, partition)
     try:
         return _assembled(problem, regions, sampler, progress, deadline)
     except BaseException:
@@ -258,11 +287,19 @@ class _Assembler:
         code = np.empty(index.size, dtype=np.uint32)
         high, wide = tile(block.cells_last, block.width)
         high = min(high, len(block.cells))
-        key = np.empty((sampler.samples, high * wide), dtype=self.key)
-        pairs, entries = merge(
-            index, block.cells_last, mean, self.number, self.group, self.bits, self.first_code,
-            key, high, wide, per_cell, control, cost, end, target, code,
-        )  # fmt: skip
+        if lanes == 1 and sampler.samples >= MANY:
+            sampler.check()
+            row = merge_one(index, self.number, self.group, self.bits, self.first_code)
+            entries = len(row[0])
+            target[:entries], code[:entries] = row
+            pairs = per_cell[0] = int(entries > 0)
+            control[0], cost[0], end[0] = 0, mean[0, 0], entries
+        else:
+            key = np.empty((sampler.samples, high * wide), dtype=self.key)
+            pairs, entries = merge(
+                index, block.cells_last, mean, self.number, self.group, self.bits,
+                self.first_code, key, high, wide, per_cell, control, cost, end, target, code,
+            )  # fmt: skip
         control, cost = control[:pairs], cost[:pairs]
         if block.controls[0]:
             control += block.controls[0]
@@ -295,6 +332,7 @@ def _pilot(sampler: Sampler, regions: Regions) -> Pilot:
 def _lengths(sampler: Sampler, regions: Regions, block: Block) -> NDArray[np.int64]:
     """Return the number of targets of every pair of a block, 0 where inadmissible."""
     index = sampler.images(block, sampler.values(block))
+    sampler.check()
     leaves = np.isnan(index)
     target = regions.number[np.where(leaves, 0.0, index).astype(np.int64)]
     target[leaves] = -1

@@ -164,6 +164,41 @@ def test_a_formula_of_many_arrays_needs_more():
     assert needed(60) - needed(10) >= 45 * 8 * 2**17
 
 
+def test_runs_count_the_arrays_of_formulas(monkeypatch):
+    """And no more: what is taken at once is at most what was asked for."""
+    sines = [f"0*sin({k}*x)" for k in range(1, 60)]
+    text = "+".join(sines) + "+" + "+".join(f"{s}*u" for s in reversed(sines))
+    result = lm.solve(made(steps(system={"kind": "map", "next": {"x": f"x-u/4+{text}"}})))
+    asked = []
+    monkeypatch.setattr(memory, "require", lambda estimate, what: asked.append(estimate))
+    tracemalloc.start()
+    result.simulate(100_000, 3)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 400 * 10**5 < taken < max(asked)
+
+
+def test_many_states_and_a_long_orbit_take_no_product():
+    orbit = [[0.1], [0.3]] * 32
+    more = {"kind": "linear", "orbit": orbit, "control": {"u": [1, -1] * 32}, "gain": {}}
+    data = steps(
+        system={"kind": "map", "next": {"x": "x+0.2*u"}},
+        control_grid={"u": {"values": [-1, 1]}},
+        attractor={"points": [[0.1], [0.3]]},
+        local_controller=more,
+    )
+    local = lm.solve(made(data)).controller.local
+    cell = np.arange(200_000) % 2
+    x = np.where(cell, 0.3, 0.1)[:, None]
+    tracemalloc.start()
+    owner, distance = local.owner(cell), local.distance(x)
+    taken = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert taken < 10**7 + 40 * len(x)
+    np.testing.assert_array_equal(owner, cell)
+    assert not distance.any()
+
+
 def test_where_ties_do_not_fit_the_policy_at_hand_stays(monkeypatch):
     data = standard_map(20)
     data["stage_cost"] = "1"
