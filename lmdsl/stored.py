@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,13 @@ from lmdsl import gamma
 from lmdsl.archive import SCOPE, identity
 from lmdsl.certificate import CLAIMS, MEASURE_TOLERANCE, Certificate
 from lmdsl.graph import CellStatus
+from lmdsl.local import LocalController
+from lmdsl.local_check import SAMPLES, LocalCheck
+from lmdsl.local_check import check as check_local
 from lmdsl.lp import StabilizationLP
 from lmdsl.result import Result, jsonable
 from lmdsl.sampler import Sampler
+from lmdsl.systems import FunctionSystem
 
 NOT_CLAIMED = (
     "backend", "solver_status", "tolerance", "polish_steps", "iterations", "gap_before_polish",
@@ -161,6 +166,51 @@ def _bracket(whole: StabilizationLP, result: Result, found: Certificate) -> list
     if 0 <= stored[0] <= low * (1 + _BRACKET) and stored[1] >= high * (1 - _BRACKET):
         return []
     return [f"gamma_bar is stored as {list(stored)}, but only {[low, high]} is proved"]
+
+
+# The local controller -------------------------------------------------------------------------
+
+
+def local_differences(
+    lp: StabilizationLP, result: Result, certificate: dict[str, Any]
+) -> list[str]:
+    """Return where the local controller does less than the directory says."""
+    stored, problem = result.local_controller, result.problem
+    if "local_controller" not in certificate:
+        return []
+    if stored is None or problem.local_controller is None:
+        if stored is None and problem.local_controller is None:
+            return []
+        word = "no" if stored is None else "a"
+        other = "one" if stored is None else "none"
+        return [f"{word} local_controller is stored, but the problem names {other}"]
+    attractor = lp.cell_status == CellStatus.ATTRACTOR
+    samples = min(max(stored.samples, 0), SAMPLES)
+    if isinstance(problem.system, FunctionSystem):  # which can be neither enclosed nor asked
+        kept = min(max(stored.kept, 0), samples)
+        cells, kind = int(attractor.sum()), problem.local_controller.kind
+        found = LocalCheck(kind, stored.multiplier, cells, None, samples, kept)
+    else:
+        local = LocalController.of(problem, lp.partition, attractor)
+        assert local is not None
+        found = check_local(problem, local, samples=samples)
+    true = {
+        "kind": stored.kind == found.kind,
+        "multiplier": _close(stored.multiplier, found.multiplier),
+        "cells": stored.cells == found.cells,
+        "proved": (stored.proved or 0) <= (found.proved or 0),
+        "samples": stored.samples == found.samples,
+        "kept": stored.kept == found.kept,
+    }
+    return [
+        _differs(f"local_controller.{name}", getattr(stored, name), getattr(found, name))
+        for name, holds in true.items()
+        if not holds
+    ]
+
+
+def _close(a: float | None, b: float | None) -> bool:
+    return a == b if a is None or b is None else math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
 
 
 # Python functions -----------------------------------------------------------------------------

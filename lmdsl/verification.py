@@ -6,7 +6,6 @@ vectors are checked against it by the same inequalities that certified them.
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,15 +19,12 @@ from lmdsl.errors import BadInput
 from lmdsl.exact import check_exactly
 from lmdsl.gamma import restricted
 from lmdsl.graph import CellStatus
-from lmdsl.local import LocalController
-from lmdsl.local_check import SAMPLES
-from lmdsl.local_check import check as check_local
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.regions import Regions
 from lmdsl.result import Result, jsonable
 from lmdsl.rows import Rows, Shares
 from lmdsl.sampling import noise_nodes, sample_points
-from lmdsl.stored import differences, function_differences
+from lmdsl.stored import differences, function_differences, local_differences
 from lmdsl.surroundings import own_arithmetic
 from lmdsl.systems import FunctionSystem
 from lmdsl.transitions import Progress, estimate
@@ -116,7 +112,9 @@ def verify(
         about = "the system is a Python function, which was not re-evaluated: its saved rows"
         notes.insert(0, f"{about} were checked")
         if result.local_controller is not None:
-            notes.append("what is said of the local controller was not checked")
+            notes.append("what the local controller does was not checked")
+        if (result.cell_status == CellStatus.BEYOND_GAMMA).any():
+            notes.append("that gamma is infeasible from the cells left out was not checked")
     lp = _restricted(lp, result, reasons, judge)
     same = result.model_sha256 in (lp.digest, archive.identity(lp))
     if not same:
@@ -130,7 +128,7 @@ def verify(
         if result.status != "verified":
             reasons.append(f"the status is {result.status}, not verified")
     reasons += differences(whole, lp, result, held.certificate, certificate)
-    reasons += _judge_local(lp, result, held.certificate)
+    reasons += local_differences(lp, result, held.certificate)
     return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
 
 
@@ -168,39 +166,6 @@ def _judge_claims(
     certificate = judge(lp, witness, result.tolerance or 0.0)
     reasons += certificate.reasons
     return certificate
-
-
-def _judge_local(lp: StabilizationLP, result: Result, certificate: dict[str, Any]) -> list[str]:
-    """Return where the local controller does less than the directory says."""
-    stored, problem = result.local_controller, result.problem
-    if isinstance(problem.system, FunctionSystem) or "local_controller" not in certificate:
-        return []
-    local = LocalController.of(problem, lp.partition, lp.cell_status == CellStatus.ATTRACTOR)
-    if stored is None or local is None:
-        if stored is None and local is None:
-            return []
-        word = "no" if stored is None else "a"
-        other = "one" if stored is None else "none"
-        return [f"{word} local_controller is stored, but the problem names {other}"]
-    found = check_local(problem, local, samples=min(max(stored.samples, 0), SAMPLES))
-    true = {
-        "kind": stored.kind == found.kind,
-        "multiplier": _close(stored.multiplier, found.multiplier),
-        "cells": stored.cells == found.cells,
-        "proved": (stored.proved or 0) <= (found.proved or 0),
-        "samples": stored.samples == found.samples,
-        "kept": stored.kept == found.kept,
-    }
-    return [
-        f"local_controller.{name} is stored as {getattr(stored, name)!r}, but is "
-        f"{getattr(found, name)!r}"
-        for name, holds in true.items()
-        if not holds
-    ]
-
-
-def _close(a: float | None, b: float | None) -> bool:
-    return a == b if a is None or b is None else math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
 
 
 def _judge_refusal(

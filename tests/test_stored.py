@@ -238,6 +238,46 @@ def test_rows_of_a_function_belong_to_one_problem(tmp_path, change, digests):
     assert "what the problem says" in found.reasons[0]
 
 
+@pytest.mark.parametrize(
+    "change",
+    [{"proved": 4}, {"kept": 10**9}, {"kept": -1}, {"samples": -5}, {"cells": 99},
+     {"kind": "linear"}],
+)  # fmt: skip
+def test_what_no_function_can_show_of_its_local_controller(tmp_path, change):
+    problem = made(standard_map(8, local_controller={"kind": "constant"}))
+    step = problem.step()
+
+    def images(**values):
+        return [np.asarray(image) for image in step(values)]
+
+    lm.solve(problem.replaced(system=FunctionSystem(next=images))).save(tmp_path / "out")
+    stored = json.loads((tmp_path / "out" / "certificate.json").read_text())
+    local = stored["local_controller"]
+    assert local["proved"] is None
+    for said, holds in ({}, True), (change, False):
+        put(tmp_path / "out", {**stored, "local_controller": {**local, **said}})
+        found = lm.verify(tmp_path / "out")
+        assert found.holds == holds
+        assert "what the local controller does was not checked" in found.notes
+    put(tmp_path / "out", {**stored, "local_controller": None})
+    assert not lm.verify(tmp_path / "out").holds
+
+
+def test_what_cannot_be_checked_of_a_function_is_said(tmp_path):
+    problem = made(corner(2.5))
+    step = problem.step()
+
+    def images(**values):
+        shape = np.broadcast_shapes(*(np.shape(x) for x in values.values()))
+        return [np.broadcast_to(image, shape) for image in step(values)]
+
+    function = problem.replaced(system=FunctionSystem(next=images))
+    lm.solve(function, restrict_to_gamma=True).save(tmp_path / "out")
+    found = lm.verify(tmp_path / "out")
+    assert found.holds
+    assert "that gamma is infeasible from the cells left out was not checked" in found.notes
+
+
 def test_a_function_saved_by_an_earlier_version_holds(tmp_path):
     result = lm.solve(function())
     result.save(tmp_path / "out")
