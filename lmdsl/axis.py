@@ -100,7 +100,7 @@ class Axis(NamedTuple):
 
 
 # The two kernels have no branch in the loop, so that they run on vectors of doubles.
-@kernel(error_model="numpy")  # division by zero cannot occur, and its test would be a branch
+@kernel
 def circle(image, low, high, width, cells, stride, index):  # type: ignore[no-untyped-def]
     """Wrap into [low, high] and add stride (k mod cells), k = floor((x - low)/width + EDGE).
 
@@ -122,7 +122,7 @@ def circle(image, low, high, width, cells, stride, index):  # type: ignore[no-un
         index[i] += stride * k if abs(turns) <= MOST_TURNS else np.nan
 
 
-@kernel(error_model="numpy")
+@kernel
 def interval(image, low, high, width, cells, stride, clip, index):  # type: ignore[no-untyped-def]
     """Add stride k, k = floor((x - low)/width + EDGE), for 0 <= k < cells; NaN elsewhere.
 

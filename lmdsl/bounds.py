@@ -33,14 +33,17 @@ CLEAR, LONG = 1.0 - 1e-12, 4_000
 """Rows of fewer than LONG entries hold where they hold with a factor CLEAR: 4,016 u < 1e-12."""
 MAX_EXACT = 20_000
 """Rows decided with exact rationals before giving up: about 0.4 s."""
+NO_BOUNDS, NO_PAIRS = np.empty(0), np.empty(0, dtype=np.int64)
+"""No room for a result that is not asked for."""
 
 
 def expected_above(lp: StabilizationLP, pair: Pairs, x: Floats, gamma: float) -> Floats:
     """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
-    upper, V, plain = np.empty(lp.n), padded(x), tame(lp, x, gamma)
+    upper, V = np.empty(lp.n), padded(x)
+    above = _above if tame(lp, x, gamma) else _carefully_above
 
     def part(cells: tuple[int, int]) -> None:
-        _above(*cells, pair.view(np.uint64), *lp.rows.kernel, gamma, V, plain, upper)
+        above(*cells, pair.view(np.uint64), *lp.rows.kernel, gamma, V, upper)
 
     over_cells(lp, part)
     return upper
@@ -88,10 +91,11 @@ def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | No
     cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
 
     def part(cells: tuple[int, int]) -> None:
-        _below(
-            *cells, *lp.kernel,
-            gamma, cost, V, plain, lower,
-        )  # fmt: skip
+        given = (*cells, *lp.kernel, gamma, cost, V, lower)
+        if plain:
+            _below(*given)
+        else:
+            _carefully(*given, NO_PAIRS)
 
     over_cells(lp, part)
     return lower
@@ -112,10 +116,8 @@ def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None)
 
     def part(cells: tuple[int, int]) -> tuple[int, Pairs]:
         found = np.empty(MAX_EXACT, dtype=np.int64)
-        count = _open(
-            *cells, *lp.kernel,
-            gamma, cost, V, plain, found,
-        )  # fmt: skip
+        given = (*cells, *lp.kernel, gamma, cost, V)
+        count, _, _ = _open(*given, found) if plain else _carefully(*given, NO_BOUNDS, found)
         return int(count), found[:count].copy()
 
     parts = over_cells(lp, part)
@@ -215,19 +217,13 @@ def worst_excess(lp: StabilizationLP, V: Floats) -> tuple[float, bool]:
     x, plain = padded(V), tame(lp, V, lp.gamma)
 
     def part(cells: tuple[int, int]) -> tuple[float, bool]:
-        worst, stuck = _excess(
-            *cells, *lp.kernel,
-            lp.gamma, lp.cost, x, plain,
-        )  # fmt: skip
+        given = (*cells, *lp.kernel, lp.gamma, lp.cost, x)
+        room = (NO_PAIRS,) if plain else (NO_BOUNDS, NO_PAIRS)
+        _, worst, stuck = (_open if plain else _carefully)(*given, *room)
         return float(worst), bool(stuck)
 
     found = over_cells(lp, part)
     return max(worst for worst, _ in found), any(stuck for _, stuck in found)
-
-
-@kernel
-def _relative(entries):  # type: ignore[no-untyped-def]
-    return (np.float64(entries) + 8.0) * UNIT
 
 
 @kernel
@@ -243,9 +239,9 @@ def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def
         if v != 0.0:
             top = v if v > top else top
             q += share[code[e]] * v
-    entries = pointer[k + ONE] - pointer[k]
-    absolute = np.float64(entries) * LEAST * (1.0 + top) if top > 0.0 else 0.0
-    return q, _relative(entries), absolute
+    entries = np.float64(pointer[k + ONE] - pointer[k])
+    absolute = entries * LEAST * (1.0 + top) if top > 0.0 else 0.0
+    return q, (entries + 8.0) * UNIT, absolute
 
 
 @kernel
@@ -262,17 +258,13 @@ def _careful(k, pointer, target, code, share, gamma, g, V):  # type: ignore[no-u
     return g if g > below else below
 
 
-@kernel(inline="always")
-def _bound_below(k, pointer, target, code, share, gamma, g, V, plain):  # type: ignore[no-untyped-def]
-    """A lower bound of gamma (P V)_k + g; ``plain`` where no product underflows."""
-    q = 0.0
-    for e in range(pointer[k], pointer[k + ONE]):
-        q += share[code[e]] * V[target[e]]
-    relative = (np.float64(pointer[k + ONE] - pointer[k]) + 8.0) * UNIT
+@kernel
+def _plain(entries, q, gamma, g):  # type: ignore[no-untyped-def]
+    """A lower bound of gamma (P V)_k + g where q is (P V)_k and no product underflows."""
+    relative = (np.float64(entries) + 8.0) * UNIT
     future = gamma * (q * (1.0 - relative))
     below = (future + g) * (1.0 - 4.0 * UNIT) if future <= LARGEST else g
-    below = g if g > below else below
-    return below if plain else _careful(k, pointer, target, code, share, gamma, g, V)
+    return g if g > below else below
 
 
 @kernel
@@ -285,43 +277,46 @@ def _inflow(pair, pointer, target, code, share, gamma, mu, total, entries):  # t
 
 
 @kernel
-def _above(first, last, pair, pointer, target, code, share, gamma, V, plain, upper):  # type: ignore[no-untyped-def]
+def _above(first, last, pair, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(first), np.uint64(last)):
         k = pair[i]
-        if plain:
-            q = 0.0
-            for e in range(pointer[k], pointer[k + ONE]):
-                q += share[code[e]] * V[target[e]]
-            relative = _relative(pointer[k + ONE] - pointer[k])
-            upper[i] = gamma * (q * (1.0 + relative)) * (1.0 + 4.0 * UNIT)
-            continue
-        q, relative, absolute = _product(k, pointer, target, code, share, V)
-        if absolute == 0.0:
-            upper[i] = 0.0
-        else:
-            future = gamma * (q * (1.0 + relative) + absolute)
-            upper[i] = future * (1.0 + 4.0 * UNIT) + 2.0 * LEAST
+        q = 0.0
+        for e in range(pointer[k], pointer[k + ONE]):
+            q += share[code[e]] * V[target[e]]
+        relative = (np.float64(pointer[k + ONE] - pointer[k]) + 8.0) * UNIT
+        upper[i] = gamma * (q * (1.0 + relative)) * (1.0 + 4.0 * UNIT)
+
+
+@kernel
+def _carefully_above(first, last, pair, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(first), np.uint64(last)):
+        q, relative, absolute = _product(pair[i], pointer, target, code, share, V)
+        future = gamma * (q * (1.0 + relative) + absolute)
+        upper[i] = 0.0 if absolute == 0.0 else future * (1.0 + 4.0 * UNIT) + 2.0 * LEAST
 
 
 @kernel
 def _below(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain, lower
+    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, lower
 ):
     for i in range(np.uint64(first), np.uint64(last)):
         best = np.inf
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             g = cost[k] if len(cost) else 0.0
-            q = _bound_below(k, pointer, target, code, share, gamma, g, V, plain)
-            if q < best:
-                best = q
+            q = 0.0
+            for e in range(pointer[k], pointer[k + ONE]):
+                q += share[code[e]] * V[target[e]]
+            below = _plain(pointer[k + ONE] - pointer[k], q, gamma, g)
+            best = below if below < best else best
         lower[i] = best
 
 
 @kernel
 def _open(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain, found
+    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, found
 ):
-    count = 0
+    """Find pairs whose bound is below V, the largest excess / cost, and if a cost of 0 has one."""
+    count, worst, stuck = 0, 0.0, False
     for i in range(np.uint64(first), np.uint64(last)):
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             g = cost[k] if len(cost) else 0.0
@@ -329,29 +324,44 @@ def _open(  # type: ignore[no-untyped-def]
             for e in range(pointer[k], pointer[k + ONE]):
                 q += share[code[e]] * V[target[e]]
             # Most rows hold by far more than rounding: no bound of their own for them.
-            sure = (gamma * q + g) * CLEAR
-            if plain and V[i] <= sure <= LARGEST and pointer[k + ONE] - pointer[k] < LONG:
+            sure, entries = (gamma * q + g) * CLEAR, pointer[k + ONE] - pointer[k]
+            if V[i] <= sure <= LARGEST and entries < LONG:
                 continue
-            if V[i] > _bound_below(k, pointer, target, code, share, gamma, g, V, plain):
+            excess = V[i] - _plain(entries, q, gamma, g)
+            if excess > 0.0:
                 if count < len(found):
                     found[count] = k
                 count += 1
-    return count
-
-
-@kernel
-def _excess(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, plain
-):
-    worst, stuck = 0.0, False
-    for i in range(np.uint64(first), np.uint64(last)):
-        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
-            below = _bound_below(k, pointer, target, code, share, gamma, cost[k], V, plain)
-            excess = V[i] - below
-            if excess > 0.0:
-                if cost[k] > 0.0:
-                    ratio = excess / cost[k] * (1.0 + 4.0 * UNIT)
+                if g > 0.0:
+                    ratio = excess / g * (1.0 + 4.0 * UNIT)
                     worst = ratio if ratio > worst else worst
                 else:
                     stuck = True
-    return worst, stuck
+    return count, worst, stuck
+
+
+@kernel
+def _carefully(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, lower, found
+):
+    """All that :func:`_below` and :func:`_open` find out, minding underflow."""
+    count, worst, stuck = 0, 0.0, False
+    for i in range(np.uint64(first), np.uint64(last)):
+        best = np.inf
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
+            g = cost[k] if len(cost) else 0.0
+            below = _careful(k, pointer, target, code, share, gamma, g, V)
+            best = below if below < best else best
+            excess = V[i] - below
+            if excess > 0.0:
+                if count < len(found):
+                    found[count] = k
+                count += 1
+                if g > 0.0:
+                    ratio = excess / g * (1.0 + 4.0 * UNIT)
+                    worst = ratio if ratio > worst else worst
+                else:
+                    stuck = True
+        if len(lower):
+            lower[i] = best
+    return count, worst, stuck

@@ -157,7 +157,7 @@ def _region(
     return Region(ends(partition, first, count), int(np.prod(count)), middle)
 
 
-@kernel
+@kernel(allocates=True)
 def _room(left, room, shape, stride, periodic):  # type: ignore[no-untyped-def]
     """Multiply room by the width, on every axis, of the widest symmetric run around a cell."""
     N = len(left)
@@ -180,7 +180,7 @@ def _room(left, room, shape, stride, periodic):  # type: ignore[no-untyped-def]
                         room[start + i * s] *= max(min(width, n), 0)
 
 
-@kernel
+@kernel(allocates=True)
 def _grow(left, shape, stride, periodic, first, count):  # type: ignore[no-untyped-def]
     """Grow a box until every face is blocked, and take its cells out of ``left``.
 

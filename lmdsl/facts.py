@@ -218,7 +218,7 @@ def reachable(pair_pointer: NDArray[np.int64], rows: Rows, start: int) -> NDArra
     return seen[:-1]
 
 
-@kernel
+@kernel(allocates=True)
 def _reach(pair_pointer, pointer, target, start, seen):  # type: ignore[no-untyped-def]
     queue = np.empty(len(seen), dtype=np.int64)
     queue[0], end, at = start, 1, 0

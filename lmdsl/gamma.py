@@ -458,7 +458,7 @@ def restricted(lp: StabilizationLP, w: Floats) -> StabilizationLP | None:
     return replace(smaller, cell_status=status, weight=weight)
 
 
-@kernel
+@kernel(allocates=True)
 def _sure_levels(before_pointer, before_pair, pointer, target, cell, pair):  # type: ignore[no-untyped-def]
     """Peel off cells with a pair all of whose successors are in A or peeled off before."""
     n = len(pair)

@@ -239,7 +239,7 @@ def owner(pair_pointer: NDArray[np.int64]) -> NDArray[np.int32]:
     return np.repeat(np.arange(len(pair_pointer) - 1, dtype=np.int32), np.diff(pair_pointer))
 
 
-@kernel
+@kernel(allocates=True)
 def _transpose(pointer, target, out_pointer, pair):  # type: ignore[no-untyped-def]
     for e in range(len(target)):
         out_pointer[target[e] + 1] += 1
@@ -284,7 +284,7 @@ def _sweep(pair_pointer, pointer, target, alive, front, all_alive, below, level,
     return visits
 
 
-@kernel
+@kernel(allocates=True)
 def _search(pointer, before, cell, alive, start, level, pair):  # type: ignore[no-untyped-def]
     """Breadth-first search from the cells of the highest level so far, over predecessors."""
     queue = np.empty(len(level), dtype=np.int64)
@@ -305,7 +305,7 @@ def _search(pointer, before, cell, alive, start, level, pair):  # type: ignore[n
                     pair[i] = k
 
 
-@kernel
+@kernel(allocates=True)
 def _remove(lost, pointer, pair, cell, pair_pointer, alive, inside, choices):  # type: ignore[no-untyped-def]
     """Remove cells, the pairs that can reach them, and cells left without a pair."""
     queue = np.empty(len(inside), dtype=np.int64)

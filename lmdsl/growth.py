@@ -219,7 +219,7 @@ def check_low(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
     return float(ratio.min()) * (1 - 4 * bounds.UNIT)
 
 
-@kernel
+@kernel(allocates=True)
 def _scale(indptr, indices, data, order, ends, x, bound, w):  # type: ignore[no-untyped-def]
     """Scale the vector of each class so that P w <= bound w; False where doubles end.
 

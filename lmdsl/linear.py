@@ -423,7 +423,7 @@ def _dense(inner: Any) -> Callable[[Floats], Floats]:
     return lambda known: np.linalg.solve(system, known)
 
 
-@kernel
+@kernel(allocates=True)
 def _spread(begin, end, indices, marked):  # type: ignore[no-untyped-def]
     """Mark everything that can reach a marked node."""
     queue = np.flatnonzero(marked)
@@ -441,7 +441,7 @@ def _spread(begin, end, indices, marked):  # type: ignore[no-untyped-def]
                 last += 1
 
 
-@kernel
+@kernel(allocates=True)
 def _topological(indptr, indices, label, count):  # type: ignore[no-untyped-def]
     """Rank the classes so that every class comes after all it leads to (Kahn's algorithm)."""
     waits = np.zeros(count, dtype=np.int64)

@@ -214,7 +214,7 @@ def _placed(
     return tape, rows
 
 
-@kernel(error_model="numpy")
+@kernel(allocates=True)
 def _run(  # type: ignore[no-untyped-def]
     long, tape, constants, rows, inputs, flat, start, stride, first, points, nodes, last,
     located, axes, clip, index, paid, weights, mean,
@@ -283,7 +283,7 @@ def _locate(image, axis, clip, index):  # type: ignore[no-untyped-def]
         interval(image, low, high, width, cells, stride, clip, index)
 
 
-@kernel(error_model="numpy")
+@kernel
 def _compute(tape, work, n):  # type: ignore[no-untyped-def]
     """Do the instructions on the first n samples of all rows."""
     for t in range(len(tape)):

@@ -52,9 +52,11 @@ def merge(  # type: ignore[no-untyped-def]
         How many were written.
     """
     pairs = entries = np.uint64(0)
-    down, right = np.uint64(len(mean) > 1), np.uint64(mean.shape[1] > 1)
+    first, _, last = index.shape
+    rows, columns = mean.shape
+    down, right = np.uint64(rows > 1), np.uint64(columns > 1)
     cells = len(per_cell)
-    controls = index.shape[0] * index.shape[2] // cells
+    controls = first * last // cells
     for c0 in range(0, cells, high):
         for a0 in range(0, controls, wide):
             c1 = c0 + high if c0 + high < cells else cells
@@ -215,7 +217,8 @@ def mean_cost(cost, points, weights, mean, least):  # type: ignore[no-untyped-de
     total = 0.0
     for weight in weights:
         total += weight
-    down, right = np.uint64(cost.shape[1] > 1), np.uint64(cost.shape[2] > 1)
+    _, rows, columns, _ = cost.shape
+    down, right = np.uint64(rows > 1), np.uint64(columns > 1)
     for i in range(np.uint64(len(mean))):
         for p in range(np.uint64(points)):
             for q in range(np.uint64(len(weights))):

@@ -156,20 +156,16 @@ class Screen:
 
     def follow(self, before: Floats, after: Floats) -> None:
         """Note that V fell from ``before`` to ``after``."""
-        self.scale *= float(_least_ratio(before, after)) * (1 - 1e-13)
+        self.scale *= _least_ratio(before, after) * (1 - 1e-13)
         if self.scale < LEAST_SCALE:
             self.rival *= self.scale
             self.scale = 1.0
 
 
-@kernel
-def _least_ratio(before, after):  # type: ignore[no-untyped-def]
-    """The smallest after / before where ``before`` is positive, at most 1."""
-    ratio = 1.0
-    for i in range(len(before)):
-        if after[i] < ratio * before[i]:
-            ratio = after[i] / before[i]
-    return ratio
+def _least_ratio(before: Floats, after: Floats) -> float:
+    """Return the smallest after / before where ``before`` is positive, at most 1."""
+    ratio = np.divide(after, before, out=np.ones(len(before)), where=before > 0)
+    return float(np.fmin.reduce(ratio, initial=1.0))
 
 
 @kernel

@@ -1,6 +1,7 @@
 """Kernels: what keeps them may be missing, full, broken or out of date; the answer stays."""
 
 import errno
+import gc
 import importlib
 import io
 import json
@@ -200,6 +201,53 @@ def test_arrays_that_can_be_written_to_and_others_share_code(folder, said):
     assert first(kernels.fixed(x)) == first(kernels.fixed(y)) == 0.0
     assert compiled(said) == 1
     assert x.flags.writeable
+
+
+def test_no_garbage_is_looked_for_while_a_kernel_is_compiled_and_again_after(folder, monkeypatch):
+    seen = []
+    on_end = kernels.Uncollected.on_end
+
+    def watched(self, event):
+        seen.append(gc.isenabled())
+        on_end(self, event)
+
+    monkeypatch.setattr(kernels.Uncollected, "on_end", watched)
+    inner = double()
+
+    @kernels.kernel
+    def outer(x):
+        return inner(x) + 1.0
+
+    @kernels.kernel
+    def wrong(x):
+        return x.nothing
+
+    assert outer(1.5) == 4.0
+    with pytest.raises(kernels.numba.TypingError):
+        wrong(1.5)
+    assert seen == [False] * 3
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        assert double()(1.5) == 3.0
+        assert not gc.isenabled()  # as the caller had it
+    finally:
+        gc.enable()
+    foreign = kernels.numba.njit(lambda x: x + 1.0)
+    assert foreign(1.0) == 2.0
+    assert seen[-1] is True  # Numba tells of it; it is left alone
+
+
+def test_a_kernel_that_allocates_says_so(folder):
+    def ones(n):
+        return np.ones(n)
+
+    assert (kernels.kernel(ones, allocates=True)(3) == 1.0).all()
+
+
+def test_options_that_numba_may_drop_are_not_needed(folder, monkeypatch):
+    monkeypatch.setattr(kernels, "COUNTS", "_no_such_option")
+    assert double()(1.5) == 3.0
 
 
 class Terminal(io.StringIO):
