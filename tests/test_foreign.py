@@ -543,6 +543,8 @@ BROKEN = {
     "names": ("names = broken_package:NAMES", "record is broken"),
     "nameless": ("nameless = broken_package:NAMELESS", "record is broken"),
     "inside": ("inside = broken_package:INSIDE", "missing_parent.child"),
+    "inside failing": ("failing = broken_package:FAILING", "broken_parent.child"),
+    "inside exiting": ("exiting = broken_package:EXITING", "broken_exit.child"),
     "twice": ("twice = broken_package:GOOD", "offered by"),
     "bad name": ("bad\x1b[2Jname = broken_package:GOOD", "no name"),
     "with:colon": ("with:colon = broken_package:GOOD", "no name"),
@@ -558,6 +560,8 @@ RECORD = Backend("record", solve, capabilities=None)
 NAMES = Backend("names", solve, Capabilities(algorithms=(1, "\\x1b")))
 NAMELESS = Backend(None, solve)
 INSIDE = Backend("inside", solve, requires=("missing_parent.child",))
+FAILING = Backend("failing", solve, requires=("broken_parent.child",))
+EXITING = Backend("exiting", solve, requires=("broken_exit.child",))
 def __getattr__(name):
     if name == "RAISES":
         raise RuntimeError("kaboom\\x1b[2J")
@@ -571,6 +575,8 @@ def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("site")
     (folder / "broken_package.py").write_text(PACKAGE)
     (folder / "broken_exit.py").write_text("import sys; sys.exit(0)")
+    (folder / "broken_parent").mkdir()
+    (folder / "broken_parent" / "__init__.py").write_text("raise RuntimeError('kaboom')")
     lines = [line for line, _ in BROKEN.values()]
     for name, entries in (
         ("broken", [*lines, "good = broken_package:GOOD", "highs = broken_package:NUMBER"]),
@@ -604,6 +610,22 @@ def test_a_broken_package_breaks_no_other(installed, capsys, lp):
     assert lm.solve(lp, "highs").status == "verified"
 
 
+@pytest.mark.parametrize("text", ["no value\n", "[lmdsl.backends]\nno value\n", "[x\n", "= 7\n"])
+def test_entry_points_that_cannot_be_read_hide_no_other(
+    installed, tmp_path, monkeypatch, capsys, lp, text
+):
+    info = tmp_path / "unreadable-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: unreadable\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(text)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert main(["backends", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["good"]["available"]
+    assert lm.solve(lp, "good").status == "verified"
+    with pytest.raises(lm.BadInput, match="offered by"):
+        lm.backends.get("twice")
+
+
 @pytest.mark.parametrize("name", BROKEN)
 def test_what_is_broken_is_said_with_the_package(installed, name):
     line, reason = BROKEN[name]
@@ -611,7 +633,7 @@ def test_what_is_broken_is_said_with_the_package(installed, name):
         lm.backends.get(line.split(" = ")[0])
     assert reason in str(refused.value)
     assert str(refused.value).isprintable()
-    if name != "inside":
+    if not name.startswith("inside"):
         assert "broken" in str(refused.value)
 
 

@@ -6,9 +6,17 @@ An entry point names a :class:`Backend`. Nothing is imported before it is asked 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import fields
 from importlib import import_module
-from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
+from importlib.metadata import (
+    EntryPoint,
+    PackageNotFoundError,
+    distributions,
+    entry_points,
+    version,
+)
 from importlib.util import find_spec
 
 from lmdsl import quiet
@@ -24,6 +32,7 @@ BUILT_IN = {
     "ipopt": "lmdsl.backends.ipopt",
 }
 DEFAULT = "policy-iteration"
+GROUP = "lmdsl.backends"
 FLAGS = [field.name for field in fields(Capabilities) if isinstance(field.default, bool)]
 
 __all__ = [
@@ -71,7 +80,8 @@ def get(name: str) -> Backend:
         )
     for package in backend.requires:
         if not _found(package):
-            raise MissingDependency(f"{name} needs the package {package}; install it", "backend")
+            needed = package if len(package) <= 100 else shown(package)
+            raise MissingDependency(f"{name} needs the package {needed}; install it", "backend")
     return backend
 
 
@@ -102,7 +112,7 @@ def plain(backend: Backend) -> Backend:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        raise BadInput(f"its record is broken: {plain_text(error)}", "backend") from None
+        raise BadInput(f"its record is broken: {_raised(error)}", "backend") from None
     if not callable(found.solve):
         raise BadInput("its record is broken: solve is no function", "backend")
     return found
@@ -156,11 +166,23 @@ def _record(name: str) -> Backend:
 def _third_party() -> dict[str, list[EntryPoint]]:
     """Return what installed packages offer, by name; the same name twice is two entries."""
     found: dict[str, list[EntryPoint]] = {}
-    for entry in entry_points(group="lmdsl.backends"):
+    for entry in _offered():
         others = found.setdefault(str(entry.name), [])
         if all(entry.value != other.value for other in others):  # else one package, seen twice
             others.append(entry)
     return found
+
+
+def _offered() -> Iterable[EntryPoint]:
+    """Return our entry points; what a package declares that cannot be read hides no other."""
+    try:
+        return entry_points(group=GROUP)
+    except Exception:
+        found: dict[str, Iterable[EntryPoint]] = {}  # of two versions on the path, the first
+        for package in distributions():
+            with suppress(Exception):
+                found.setdefault(package.name, package.entry_points.select(group=GROUP))
+        return [entry for entries in found.values() for entry in entries]
 
 
 def _loaded(name: str, entries: list[EntryPoint]) -> Backend:
@@ -176,9 +198,8 @@ def _loaded(name: str, entries: list[EntryPoint]) -> Backend:
     except KeyboardInterrupt:
         raise
     except BaseException as error:
-        said = plain_text(f"{type(error).__name__}: {plain_text(error)}")
         raise BadInput(
-            f"{by} offers {shown(name)}, which does not load: {said}", "backend"
+            f"{by} offers {shown(name)}, which does not load: {_raised(error)}", "backend"
         ) from None
     if not isinstance(found, Backend):
         raise BadInput(f"{by} offers {shown(name)}, which is no lmdsl.backends.Backend", "backend")
@@ -197,6 +218,10 @@ def _package(entry: EntryPoint) -> str:
         return "an unnamed package"
 
 
+def _raised(error: BaseException) -> str:
+    return plain_text(f"{type(error).__name__}: {plain_text(error)}")
+
+
 def _said(name: str) -> str:
     return name if name.isprintable() else shown(name)
 
@@ -211,5 +236,7 @@ def _found(package: str) -> bool:
     try:
         with quiet.foreign():  # the folder of a dotted name is imported
             return find_spec(package) is not None
-    except (ImportError, ValueError):  # a package inside one that is missing
+    except KeyboardInterrupt:
+        raise
+    except BaseException:  # a package inside one that is missing, or that fails or exits
         return False
