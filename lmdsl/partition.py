@@ -161,7 +161,10 @@ class Partition(Frozen):
 
         NaN on a circle of which an image is too many turns away. Parameters as for :meth:`locate`.
         """
-        saturate = self.clip if clip is None else clip
+        images = inputs.states(images, self.names, "images")
+        if images.ndim != 2:
+            raise BadInput(f"states have shape (r, {self.dimension}), not {images.shape}", "images")
+        saturate = self.clip if clip is None else inputs.flag(clip, "clip")
         columns = [axis.state(images[:, k], saturate) for k, axis in enumerate(self.axes)]
         return np.stack(columns, axis=-1)
 

@@ -224,6 +224,12 @@ def test_what_is_no_image_is_not_located(bad):
     refused(lambda: RESULT.partition.locate(bad), "images")
 
 
+@pytest.mark.parametrize("bad", ["a", [0.1, 0.2], [["a", "b"]], [[1j, 0]], [[0.1]], [[[0.1, 0.2]]]])
+def test_what_is_no_state_becomes_none(bad):
+    refused(lambda: PLANE.partition.states(bad), "images")
+    assert PLANE.partition.states([[1.5, -0.25]]).tolist() == [[0.5, 0.75]]
+
+
 def test_images_of_any_real_kind_are_located():
     for kind in (np.float32, ">f8", np.longdouble, np.float16):
         x = np.array([0.25, 0.75], kind)
