@@ -179,6 +179,8 @@ class Simulation(Frozen):
             f"  lost                   {self.lost}",
             f"  cycling                {self.cycling}",
         ]
+        if self.cut:
+            lines[-1] += f"  (or cut off by the time limit after {self.steps_made} steps)"
         if self.steps:
             steps = ", ".join(f"{k} {v}" for k, v in self.steps.items())
             lines.append(f"  steps                  {steps}")

@@ -15,23 +15,28 @@ from lmdsl.certificate import (
     with_stated_gap,
 )
 from lmdsl.lp import StabilizationLP
+from lmdsl.program import Check
 from lmdsl.sums import LARGEST, rounded_down, rounded_up
 
 
-def check_exactly(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
+def check_exactly(
+    lp: StabilizationLP, witness: Witness, tolerance: float, check: Check | None = None
+) -> Certificate:
     """Check every claim of a witness in rational arithmetic.
 
     Parameters
     ----------
     lp, witness, tolerance
         As for :func:`lmdsl.certificate.check`; a claim that holds only with equality holds.
+    check
+        Called now and then; it may raise.
     """
     pair = witness.pair if witness.pair is not None and is_policy(lp, witness.pair) else None
     V_up, W, w, mu = (
         rational.fractions(x) if x is not None and is_sound(lp, x) else None
         for x in (witness.V_up, witness.W, witness.w, witness.mu)
     )
-    rows = None if pair is None else [row for _, row in rational.rows(lp, pair)]
+    rows = None if pair is None else [row for _, row in rational.rows(lp, pair, check)]
     contraction = cost = floor = residual = gap = None
     if rows is not None and pair is not None:
         if w is not None:
@@ -40,7 +45,7 @@ def check_exactly(lp: StabilizationLP, witness: Witness, tolerance: float) -> Ce
             cost = _mean(lp, V_up)
         if mu is not None:
             residual = rational.residual(lp, rows, mu)
-    if W is not None and rational.below_all(lp, W, lp.cost):
+    if W is not None and rational.below_all(lp, W, lp.cost, check):
         floor = _mean(lp, W)
     if cost is not None and cost > LARGEST:
         cost = None
@@ -51,7 +56,10 @@ def check_exactly(lp: StabilizationLP, witness: Witness, tolerance: float) -> Ce
         upper_bound=cost is not None,
         lower_bound=floor is not None,
         measure=residual is not None and mu is not None and residual <= allowed_residual(mu),
-        refusal=pair is None and w is not None and any(w) and rational.below_all(lp, w, None),
+        refusal=pair is None
+        and w is not None
+        and any(w)
+        and rational.below_all(lp, w, None, check),
         contraction=None if contraction is None or contraction >= 1 else rounded_up(contraction),
         cost=None if cost is None else rounded_up(cost),
         lower=None if floor is None else rounded_down(floor),

@@ -71,9 +71,10 @@ class LocalCheck:
         """Return one line for people."""
         line = f"{self.kind}: "
         if self.proved is not None:
-            line += f"keeps {self.proved} of {self.cells} attractor cells "
-            line += "(proved for the map as computed); "
-        line += f"keeps {self.kept} of {self.samples} random states of A"
+            known = f"{self.proved} of {self.cells} attractor cells are"
+            line += known if self.proved else "no attractor cell is"
+            line += " proved to be kept (by the map as computed); "
+        line += f"{self.kept} of {self.samples} random states of A were kept"
         if self.multiplier is not None:
             line += f"; orbit's multiplier {self.multiplier:.4g}"
         return line

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.lp import StabilizationLP
+from lmdsl.program import Check
 
 Row = list[tuple[int, int]]
 Floats = NDArray[np.float64]
@@ -21,10 +22,14 @@ Pairs = NDArray[np.int64]
 BLOCK = 2**14
 
 
-def rows(lp: StabilizationLP, columns: NDArray[np.int64]) -> Iterator[tuple[int, Row]]:
-    """Yield (column, [(target in C, numerator), ...]), block by block."""
+def rows(
+    lp: StabilizationLP, columns: NDArray[np.int64], check: Check | None = None
+) -> Iterator[tuple[int, Row]]:
+    """Yield (column, [(target in C, numerator), ...]), block by block; ``check`` may raise."""
     numerator, n = lp.rows.shares.numerator, lp.n
     for i in range(0, len(columns), BLOCK):
+        if check is not None:
+            check()
         block = columns[i : i + BLOCK]
         taken = lp.rows.take(block)
         pointer, target, code = taken.pointer.tolist(), taken.target.tolist(), taken.code.tolist()
@@ -80,14 +85,16 @@ def above_policy(lp: StabilizationLP, policy: list[Row], pair: Pairs, V: list[Fr
     )
 
 
-def below_all(lp: StabilizationLP, x: list[Fraction], cost: Floats | None) -> bool:
+def below_all(
+    lp: StabilizationLP, x: list[Fraction], cost: Floats | None, check: Check | None = None
+) -> bool:
     """Decide x <= gamma P_a x + G_a for every surviving pair."""
     a, shift = integers(x)
     p, q = lp.gamma.as_integer_ratio()
     total = lp.rows.shares.total
     left = [value * q * total for value in a]
     unit = q * total * 2**shift
-    for k, row in rows(lp, np.arange(lp.K, dtype=np.int64)):
+    for k, row in rows(lp, np.arange(lp.K, dtype=np.int64), check):
         lacking = left[lp.cell[k]] - p * sum(a[j] * s for j, s in row)
         if lacking > 0 and (cost is None or lacking > Fraction(float(cost[k])) * unit):
             return False

@@ -69,6 +69,21 @@ def refuse_unless_free(path: str | os.PathLike[str]) -> None:
         raise BadInput(f"cannot use {text}: {reason(error)}", "out") from None
 
 
+def refuse_own_file(path: str | os.PathLike[str]) -> None:
+    """Refuse to write something else in place of a file of a result directory.
+
+    Raises
+    ------
+    BadInput
+        The path, links followed, is one of a result's own files.
+    """
+    target = Path(os.path.realpath(path))
+    if target.name in NAMES and _marked(target.parent):
+        raise BadInput(
+            f"{shown(str(path), 200)} is a part of the result; choose another name", "out"
+        )
+
+
 def _refuse_foreign(target: Path, text: str) -> None:
     held = {name for name in os.listdir(target) if not _IGNORED.fullmatch(name)}
     if held and not _marked(target):

@@ -9,12 +9,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from lmdsl import archive, inputs, memory
 from lmdsl.certificate import CLAIMS, Certificate, Witness, check
+from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput
 from lmdsl.exact import check_exactly
 from lmdsl.gamma import restricted
@@ -80,7 +82,10 @@ class Verification:
 
 @own_arithmetic
 def verify(
-    path: str | os.PathLike[str], exact: bool = False, progress: Progress | None = None
+    path: str | os.PathLike[str],
+    exact: bool = False,
+    progress: Progress | None = None,
+    time_limit: float | Deadline | None = None,
 ) -> Verification:
     """Recompile the problem of a result directory and check every claim it makes.
 
@@ -92,13 +97,20 @@ def verify(
         Judge in rational arithmetic, without tolerance on claims 1 to 3 (slower).
     progress
         Called with (stage, fraction done) during long work.
+    time_limit
+        Seconds.
 
     Raises
     ------
+    TimeLimitReached
+        The time limit was reached.
     BadInput
         The directory cannot be read.
     """
-    judge = check_exactly if inputs.flag(exact, "exact") else check
+    late = Deadline.of(time_limit)
+    in_time = partial(late.check, "verifying")
+    exactly = partial(check_exactly, check=in_time)
+    judge = exactly if inputs.flag(exact, "exact") else check
     path = inputs.path(path)
     held = archive.read(path)
     result, reasons = held.result, list[str]()
@@ -106,7 +118,8 @@ def verify(
         f"{name} was written anew since the save; what it holds now was judged"
         for name in held.rewritten
     ]
-    lp = whole = recompiled(path, result, progress)
+    lp = whole = recompiled(path, result, progress, late)
+    in_time()
     if isinstance(result.problem.system, FunctionSystem):
         reasons += function_differences(lp, result)
         about = "the system is a Python function, which was not re-evaluated: its saved rows"
@@ -128,7 +141,8 @@ def verify(
         if result.status != "verified":
             reasons.append(f"the status is {result.status}, not verified")
     reasons += differences(whole, lp, result, held.certificate, certificate)
-    reasons += local_differences(lp, result, held.certificate)
+    in_time()
+    reasons += local_differences(lp, result, held.certificate, late)
     return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
 
 
@@ -146,12 +160,15 @@ def _restricted(
 
 
 def recompiled(
-    path: str | os.PathLike[str], result: Result, progress: Progress | None = None
+    path: str | os.PathLike[str],
+    result: Result,
+    progress: Progress | None = None,
+    time_limit: float | Deadline | None = None,
 ) -> StabilizationLP:
     """Return the finite model of a directory made anew; of a Python function, its saved rows."""
     if isinstance(result.problem.system, FunctionSystem):
         return _stored_model(path, result)
-    return compile(result.problem, progress)
+    return compile(result.problem, progress, time_limit)
 
 
 def _judge_claims(

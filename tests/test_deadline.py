@@ -220,7 +220,9 @@ def test_the_local_check_ends_with_what_it_knows():
     assert (less.samples, less.proved) > (0, 0)
     late = checked(problem, Asked(1))
     assert (late.samples, late.kept, late.proved) == (0, 0, 0)
+    assert "no attractor cell is proved to be kept" in late.sentence()
     assert "0 of 0 random" in late.sentence()
+    assert f"{found.proved} of {found.cells} attractor cells are proved" in found.sentence()
 
 
 def test_the_local_check_takes_fewer_samples_where_they_are_dear():
@@ -320,3 +322,58 @@ def test_many_samples_are_sorted_to_the_same_rows(monkeypatch):
             assert lm.compile(made(data)).digest == usual
             patch.setattr("lmdsl.transitions.MANY", 1)
             assert lm.compile(made(data)).digest == usual
+
+
+# Saved results ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def saved(tmp_path, monkeypatch):
+    """A result that takes more than a moment to make anew."""
+    monkeypatch.setattr("lmdsl.transitions.SHORT", 0)
+    lm.solve(made(standard_map(20))).save(tmp_path / "out")
+    return str(tmp_path / "out")
+
+
+def test_verify_ends_and_says_nothing_about_the_claims(saved, capsys):
+    with pytest.raises(TimeLimitReached):
+        lm.verify(saved, time_limit=1e-9)
+    assert main(["verify", saved, "--time-limit", "1e-9", "--json"]) == 4
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["status"] == "solver_failed"
+    assert "time limit reached" in answer["message"]
+    assert main(["verify", saved, "--time-limit", "1000", "--exact"]) == 0
+    for exact in (False, True):
+        whole = Asked()
+        assert lm.verify(saved, exact, time_limit=whole).holds
+        for part in (0.3, 0.8, 0.99):
+            with pytest.raises(TimeLimitReached):
+                lm.verify(saved, exact, time_limit=Asked(int(part * whole.count)))
+
+
+def test_verify_in_rational_arithmetic_asks_between_blocks(saved, monkeypatch):
+    monkeypatch.setattr("lmdsl.rational.BLOCK", 10)
+    few, many = Asked(), Asked()
+    assert lm.verify(saved, time_limit=few).holds
+    assert lm.verify(saved, exact=True, time_limit=many).holds
+    assert many.count > few.count + 50
+
+
+def test_a_local_controller_is_checked_whole_or_not_at_all(tmp_path):
+    problem = local(cells=8, substeps=1)
+    lm.solve(problem).save(tmp_path / "out")
+    whole = Asked()
+    assert lm.verify(tmp_path / "out", time_limit=whole).holds
+    with pytest.raises(TimeLimitReached):  # not: "is stored as ..., but is ..."
+        lm.verify(tmp_path / "out", time_limit=Asked(whole.count - 10))
+
+
+def test_simulate_and_export_end_too(saved, tmp_path, capsys):
+    assert main(["simulate", saved, "--time-limit", "1e-9", "--starts", "50"]) == 0
+    assert "or cut off by the time limit after 0 steps" in capsys.readouterr().out
+    target = tmp_path / "x"
+    arguments = ["export", saved, "--format", "certificate", "--out", str(target)]
+    assert main([*arguments, "--time-limit", "1e-9"]) == 4
+    assert not target.exists()
+    assert main([*arguments, "--time-limit", "1000"]) == 0
+    assert target.exists()

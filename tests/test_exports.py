@@ -601,3 +601,19 @@ def test_a_python_function_is_exported_from_its_saved_rows(tmp_path, capsys):
     export_certificate(result, tmp_path / "same")
     assert path.read_text() == (tmp_path / "same").read_text()
     capsys.readouterr()
+
+
+@pytest.mark.parametrize("name", ["certificate.json", "solution.npz", "problem.json", "link"])
+@pytest.mark.parametrize("form", ["certificate", "drn"])
+def test_an_export_does_not_replace_the_result(tmp_path, capsys, name, form):
+    out = tmp_path / "out"
+    lm.solve(made(steps())).save(out)
+    (tmp_path / "link").symlink_to(out / "solution.npz")
+    target = tmp_path / name if name == "link" else out / name
+    arguments = ["export", str(out), "--format", form, "--out"]
+    assert main([*arguments, str(target)]) == 2
+    assert "is a part of the result; choose another name" in capsys.readouterr().err
+    assert lm.verify(out).holds
+    (tmp_path / "solution.npz").write_text("of somebody else")
+    assert main([*arguments, str(tmp_path / "solution.npz")]) == 0
+    assert main([*arguments, str(out / "model.txt")]) == 0

@@ -403,7 +403,7 @@ def test_a_proof_is_of_every_state_and_of_the_map_as_computed(text, axis, cells,
     assert found.proved == proved
     if proved == found.cells:
         assert found.kept == found.samples
-    assert "(proved for the map as computed)" in found.sentence()
+    assert "proved to be kept (by the map as computed)" in found.sentence()
 
 
 def states_at(partition, cell, rng):

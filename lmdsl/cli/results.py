@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -18,6 +19,7 @@ def add(command: Command) -> None:
     verify.add_argument("dir", metavar="DIR", help="result directory")
     verify.add_argument("--exact", action="store_true",
                         help="judge in rational arithmetic, without tolerance")  # fmt: skip
+    _time_limit(verify)
     as_json(verify)
 
     simulate = command("simulate", _simulate, "Run the true map under a saved controller.")
@@ -27,6 +29,7 @@ def add(command: Command) -> None:
     simulate.add_argument("--seed", type=int, default=0, metavar="S")
     simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
                           help="with a local controller, steps after reaching A")  # fmt: skip
+    _time_limit(simulate)
     as_json(simulate)
 
     plot = command("plot", _plot, "Draw the figures of a saved result.")
@@ -38,13 +41,18 @@ def add(command: Command) -> None:
     export.add_argument("--format", required=True, choices=("certificate", "drn"),
                         help="certificate: to be checked alone; drn: for Storm")  # fmt: skip
     export.add_argument("--out", required=True, metavar="FILE", help="file to write")
+    _time_limit(export)
+
+
+def _time_limit(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--time-limit", type=float, metavar="S", help="seconds")
 
 
 def _verify(parsed: Arguments) -> int:
     from lmdsl.verification import verify
 
     with Progress() as progress:
-        found = verify(parsed.dir, parsed.exact, progress)
+        found = verify(parsed.dir, parsed.exact, progress, parsed.time_limit)
     if parsed.json:
         print_json(found.to_dict())
     else:
@@ -64,7 +72,9 @@ def _simulate(parsed: Arguments) -> int:
     result = Result.load(parsed.dir)
     with Progress() as progress:
         progress("simulate", -1.0)
-        runs = result.simulate(parsed.starts, parsed.steps, parsed.seed, parsed.hold)
+        runs = result.simulate(
+            parsed.starts, parsed.steps, parsed.seed, parsed.hold, parsed.time_limit
+        )
     if parsed.json:
         print_json(runs.to_dict())
         print(f"lmdsl: {AS_STORED}", file=sys.stderr)
@@ -87,11 +97,13 @@ def _plot(parsed: Arguments) -> int:
 def _export(parsed: Arguments) -> int:
     from lmdsl.exports import export_certificate, export_drn
     from lmdsl.result import Result
+    from lmdsl.saving import refuse_own_file
     from lmdsl.verification import recompiled
 
+    refuse_own_file(parsed.out)
     result = Result.load(parsed.dir)
     with Progress() as progress:
-        lp = recompiled(parsed.dir, result, progress)
+        lp = recompiled(parsed.dir, result, progress, parsed.time_limit)
     if parsed.format == "drn":
         export_drn(lp, parsed.out)
     else:

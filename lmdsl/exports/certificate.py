@@ -20,6 +20,7 @@ from lmdsl.gamma import restricted
 from lmdsl.graph import CellStatus
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.result import Result
+from lmdsl.saving import refuse_own_file
 from lmdsl.surroundings import own_arithmetic
 
 FORMAT = "lmdsl-certificate/1"
@@ -63,6 +64,7 @@ def export_certificate(
         raise BadInput("the result and the model have different cells")
     if not refused and (result.control_index[lp.cells] < 0).any():
         raise BadInput("there is no controller to export: " + result.message)
+    refuse_own_file(inputs.path(path))
     write_whole(inputs.path(path), _lines(_head(result, lp, refused), result, lp, refused))
 
 

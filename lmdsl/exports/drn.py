@@ -14,6 +14,7 @@ from lmdsl import inputs
 from lmdsl.errors import BadInput
 from lmdsl.files import write_whole
 from lmdsl.lp import StabilizationLP
+from lmdsl.saving import refuse_own_file
 from lmdsl.surroundings import own_arithmetic
 
 
@@ -50,6 +51,7 @@ def export_drn(lp: StabilizationLP, path: str | os.PathLike[str]) -> None:
         raise BadInput("the stabilizable set is empty; there is no model to export")
     if not lp.weight.any():
         raise BadInput("no cell of `measure` is stabilizable; there is no initial state")
+    refuse_own_file(inputs.path(path))
     write_whole(inputs.path(path), _lines(lp))
 
 
