@@ -90,11 +90,16 @@ def both(one: Callable[[], First], other: Callable[[], Second], pays: bool) -> t
     return found[0], found[1]
 
 
-def in_order(work: Callable[[Part], Outcome], parts: Iterable[Part]) -> Iterator[Outcome]:
+def in_order(
+    work: Callable[[Part], Outcome],
+    parts: Iterable[Part],
+    cancel: Callable[[], object] = lambda: None,
+) -> Iterator[Outcome]:
     """Yield ``work(part)`` for every part of a long series, in order, a few parts ahead.
 
     The calling thread works too. The first part that raises ends the iteration with its error;
-    the parts begun are waited for, the others never begin.
+    the parts begun are waited for, the others never begin. ``cancel`` is called before waiting, to
+    end those begun early: an interrupt is not to wait for the end of a long part.
     """
     helpers = _helpers()
     if not helpers:
@@ -112,6 +117,9 @@ def in_order(work: Callable[[Part], Outcome], parts: Iterable[Part]) -> Iterator
                 yield ahead.popleft().result()
         while ahead:
             yield ahead.popleft().result()
+    except BaseException:
+        cancel()
+        raise
     finally:
         wait([future for future in ahead if not future.cancel()])
 

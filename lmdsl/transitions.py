@@ -214,7 +214,8 @@ def _assembled(
     # glibc returns the memory of a block to the system, to fault it in again for the next one,
     # unless it has seen more than that freed at once.
     np.empty(2**20)
-    for block, rows in threads.in_order(_Assembler(sampler, regions), sampler.blocks(regions.free)):
+    assembler, parts = _Assembler(sampler, regions), sampler.blocks(regions.free)
+    for block, rows in threads.in_order(assembler, parts, deadline.cancel):
         pair_pointer[1 + block.first : 1 + block.first + len(block.cells)] += rows.per_cell
         pointer.append(rows.end + target.used)
         control.append(rows.control)

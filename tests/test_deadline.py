@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import json
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from lmdsl import stabilize, witness
 from lmdsl.cli import main
 from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.lp import compile
+from lmdsl.threads import in_order
 from lmdsl.transitions import SHORT, unless_short
 
 
@@ -140,6 +143,32 @@ def test_an_interrupt_ends_the_threads_that_help(monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         compile(made(standard_map(50)), interrupt, deadline)
     assert deadline()
+
+
+def test_an_interrupt_does_not_wait_for_the_end_of_a_long_part(monkeypatch):
+    monkeypatch.setattr("lmdsl.threads.count", lambda: 2)
+    deadline, begun = Deadline(), threading.Event()
+
+    def work(part):
+        if threading.current_thread() is threading.main_thread():
+            begun.wait()
+            raise KeyboardInterrupt
+        begun.set()
+        for _ in range(10_000):
+            if deadline():
+                return "ended"
+            time.sleep(0.001)
+        return deadline.cancel()  # for the test to end
+
+    cancelled = []
+
+    def cancel():
+        cancelled.append(deadline())
+        deadline.cancel()
+
+    with pytest.raises(KeyboardInterrupt):
+        list(in_order(work, range(100), cancel))
+    assert cancelled == [False]
 
 
 def test_the_restricted_solve_gets_what_is_left(monkeypatch):
