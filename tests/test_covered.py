@@ -49,6 +49,7 @@ def circling(cells=4):
     return data
 
 
+@pytest.mark.long
 def test_a_pendulum_with_one_sample_a_cell_says_so(solve, monkeypatch):
     status, out, err = solve(PENDULUM)
     assert (status, err) == (0, "")

@@ -254,12 +254,14 @@ def test_the_local_check_ends_with_what_it_knows():
     assert f"{found.proved} of {found.cells} attractor cells are proved" in found.sentence()
 
 
+@pytest.mark.long
 def test_the_local_check_takes_fewer_samples_where_they_are_dear():
     few = checked(local(nodes=50, substeps=100))
     assert 10 <= few.kept == few.samples < 10_000
     assert checked(local(nodes=50, substeps=100), samples=37).samples == 37
 
 
+@pytest.mark.long
 def test_a_directory_with_another_number_of_samples_is_verified(tmp_path):
     problem = local(cells=8, substeps=1)
     lm.solve(problem).save(tmp_path / "out")

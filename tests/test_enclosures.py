@@ -160,12 +160,14 @@ def hammer(seed, count, points, plain):
     return seen, narrow
 
 
+@pytest.mark.long
 def test_computed_values_lie_in_the_enclosure():
     seen, narrow = hammer(0, 1500, 60, plain=False)
     assert seen > 30_000
     assert narrow > 200
 
 
+@pytest.mark.long
 def test_plain_formulas_also_over_the_rationals():
     seen, narrow = hammer(1, 1500, 60, plain=True)
     assert seen > 30_000

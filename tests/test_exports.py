@@ -299,6 +299,7 @@ def test_a_spoiled_statement_is_refused(spoil, name, factor, claim):
     assert fails(said, claim)
 
 
+@pytest.mark.long
 def test_what_is_missing_is_noticed(spoil):
     def pair(head, cells, pairs):
         del pairs[3]

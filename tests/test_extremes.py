@@ -304,6 +304,7 @@ def tried(seeds):
     return count
 
 
+@pytest.mark.long
 def test_no_check_says_yes_where_fractions_say_no():
     count = tried(range(700))
     assert min(count.values()) > 3, count
@@ -362,6 +363,7 @@ def test_solving_ends_at_length():
         made_witness(seed)
 
 
+@pytest.mark.long
 def test_a_gamma_out_of_sight_is_decided_soon(monkeypatch):
     """From 1 up to 1e300 by exponents: bisection of the numbers took a thousand proofs a policy."""
     asked = []

@@ -238,6 +238,7 @@ def try_file(folder, seed):
             one_line(error)
 
 
+@pytest.mark.long
 @settings(max_examples=2000, deadline=None, derandomize=True)
 @given(seed=SEEDS)
 def test_spoiled_problem_files(folder, seed):
@@ -578,6 +579,7 @@ def called(*arguments):
     return status, out.getvalue(), err.getvalue()
 
 
+@pytest.mark.long
 @settings(max_examples=600, deadline=None, derandomize=True)
 @given(seed=SEEDS)
 def test_spoiled_results(folder, saved, seed):

@@ -58,6 +58,7 @@ def test_killed_at_every_line(tmp_path, new):
     assert found["left behind"] > 5
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # from the tracing
 def test_interrupted_at_every_line_of_a_save(tmp_path, monkeypatch):
     """Ctrl-C during a save never loses the directory: it is the old one or the new one."""
@@ -228,6 +229,7 @@ print(json.dumps(found))
 """
 
 
+@pytest.mark.long
 @posix
 def test_same_bytes_in_every_process(tmp_path):
     jobs = [(standard_map(30), "policy-iteration"), (NOISY, "policy-iteration"), (NOISY, "highs")]

@@ -52,6 +52,7 @@ coordinate = st.one_of(
 width = st.sampled_from([0.0, 1e-9, 0.01, 0.3, 2.0])
 
 
+@pytest.mark.long
 @settings(max_examples=1500, deadline=None, derandomize=True)
 @given(formulas(), coordinate, coordinate, width, width, st.integers(0, 2**32 - 1))
 def test_values_and_slopes_lie_in_the_enclosure(text, x, y, wx, wy, seed):

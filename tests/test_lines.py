@@ -42,6 +42,7 @@ def compared(problem, blocks=3):
     )
 
 
+@pytest.mark.long
 def test_random_problems(monkeypatch):
     """Maps and differential equations, noise, clipping, one to three axes, one or two controls."""
     rng, seen = np.random.default_rng(20), set()

@@ -178,6 +178,7 @@ def test_noise_counts_at_every_node():
         assert (found.kept == 10_000) == (proved == 2)
 
 
+@pytest.mark.long
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(st.integers(0, 2**32 - 1))
 def test_what_is_proved_holds_at_every_point(seed):
@@ -315,6 +316,7 @@ def test_a_jump_at_the_orbit_cannot_be_linearised():
         lm.compile(made(data))
 
 
+@pytest.mark.long
 def test_a_long_enclosure_stops_in_time(monkeypatch):
     text = " + ".join(["0.001*sin(x0)"] * 150)
     data = linear_system([[0.5]], [[1.0]], cells=2000)

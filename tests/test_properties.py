@@ -333,6 +333,7 @@ def spoil(rng, x):
     return x
 
 
+@pytest.mark.long
 def test_no_false_claim_passes():
     """Fast and exact checks against the definition; 4,000 spoiled witnesses."""
     rng = np.random.default_rng(5)

@@ -116,6 +116,7 @@ def test_files_keep_it(schema):
     assert "FunctionSystem" not in json.dumps(schema)
 
 
+@pytest.mark.long
 def test_what_it_refuses_the_reader_refuses(schema):
     """600 spoiled files, and 100 that are right."""
     validator, refused = Draft202012Validator(schema), 0
@@ -193,6 +194,7 @@ def walk(schema, root, data, path=()):
             yield from walk(schema["items"], root, inner, (*path, k))
 
 
+@pytest.mark.long
 def test_every_bound_is_one_of_the_readers(schema):
     """Each bound broken apart, in a file that is right but for it."""
     validator, broken = Draft202012Validator(schema), set()

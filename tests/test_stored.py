@@ -99,6 +99,7 @@ def places(data, path=()):
 WEAKER = {"gamma_bar", "proved", "measure_residual"}
 
 
+@pytest.mark.long
 def test_every_field_of_the_certificate(saved):
     good = json.loads((saved / "certificate.json").read_text())
     tried = 0
@@ -131,6 +132,7 @@ def test_every_field_of_the_certificate(saved):
     assert tried > 50
 
 
+@pytest.mark.long
 def test_every_array(saved):
     good = json.loads((saved / "certificate.json").read_text())
     with np.load(saved / "solution.npz") as held:
