@@ -22,6 +22,9 @@ Bools = NDArray[np.bool_]
 SWEEPS, MOST_ROUNDS = 30, 8
 """Sweeps after which a proof is given up unless they moved it much less than the ones before."""
 
+LEAST_UNIT = 1e-140
+"""Least unit of a component: quotients of two stay within doubles."""
+
 NEAR = 64
 """Largest level up to which a few passes from the levels may make a stabilizing policy."""
 
@@ -38,11 +41,11 @@ class Feasible:
 class Refused:
     """A candidate proof that no policy is gamma-stabilizing: w >= 0, w <= gamma P_a w for all a.
 
-    ``pair`` is a policy that is stabilizing at ``lower`` < gamma.
+    ``best`` is a policy that is stabilizing at ``lower`` < gamma.
     """
 
     w: Floats
-    pair: Pairs
+    best: growth.Growth
     lower: float
 
 
@@ -170,7 +173,7 @@ def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
     Then the last policy is stabilizing at gamma', and as a rule at gamma too. Else w is the proof
     against gamma; the slack absorbs rounding.
     """
-    best = growth.short_lived(lp, stop)
+    best = growth.improved(lp, growth.short_lived(lp, stop), stop, lp.gamma)
     for slack in (1e-6, 1e-9, 1e-12, 0.0):
         if best.limit > lp.gamma:
             w, _ = stability_vector(lp, best.pair, stop=stop)
@@ -178,12 +181,15 @@ def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
                 return Feasible(best.pair, w)
         at = lp.gamma * (1 - slack)
         going = best.rate * at < 1 - 1e-12
-        found = optimal_stopping(lp, at, np.ones(lp.n), best.pair, going, stop)
+        reward = np.where(going, 1.0, best.x)
+        found = optimal_stopping(lp, at, reward, best.pair, going, stop)
         if found is None:
             break
         if found.refuses:
             low, _ = growth.prove_low(lp, best) or (0.0, None)
-            return Refused(found.carried, best.pair, low)
+            # Small entries may be rounding, or what carries a vector that falls over many decades.
+            w = found.w if bounds.holds_for_all(lp, found.w, lp.gamma, None) else found.carried
+            return Refused(w, best, low)
         if found.going.all():
             better = growth.of_policy(lp, found.pair, stop)
             best = better if better.limit > best.limit else best
@@ -266,7 +272,7 @@ def _stopping(
     limit: int,
 ) -> Stopping:
     zero = np.zeros(lp.K)
-    w = _stopped(lp, gamma, reward, pair, going, stop)
+    w = _stopped(lp, gamma, reward, pair, going, reward, stop)
     if w is None:
         going = np.zeros(lp.n, dtype=np.bool_)
         w = reward
@@ -286,7 +292,7 @@ def _stopping(
             new_going = np.where(change, better.value <= reward, new_going)
         if lowered is w:
             return Stopping(np.minimum(w, reward), pair, going, True)
-        new = _stopped(lp, gamma, reward, new_pair, new_going, stop)
+        new = _stopped(lp, gamma, reward, new_pair, new_going, w, stop)
         if new is None or not (new < w).any():
             break  # rounding made a change look better than it is
         w, pair, going = new, new_pair, new_going
@@ -294,14 +300,25 @@ def _stopping(
 
 
 def _stopped(
-    lp: StabilizationLP, gamma: float, reward: Floats, pair: Pairs, going: Bools, stop: Stop
+    lp: StabilizationLP,
+    gamma: float,
+    reward: Floats,
+    pair: Pairs,
+    going: Bools,
+    before: Floats,
+    stop: Stop,
 ) -> Floats | None:
-    """Return what a stopping policy is paid: w = gamma P w where it goes, the reward elsewhere."""
+    """Return what a stopping policy is paid: w = gamma P w where it goes, the reward elsewhere.
+
+    It is solved in units of ``before``, as w may fall over many decades.
+    """
     w = reward.copy()
     if going.any():
+        unit = np.maximum(before, LEAST_UNIT)
         P = gamma * lp.rows.matrix(pair[going])
-        new = linear.solve(P[:, going], P[:, ~going] @ reward[~going], stop=stop)
+        P.data *= unit[P.indices] / np.repeat(unit[going], np.diff(P.indptr))
+        new = linear.solve(P[:, going], P[:, ~going] @ (reward / unit)[~going], stop=stop)
         if new is None:
             return None
-        w[going] = new
+        w[going] = unit[going] * new
     return w

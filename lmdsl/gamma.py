@@ -44,6 +44,7 @@ from lmdsl.transitions import Progress
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 WIDTH, LEAST_WIDTH = 1e-6, 1e-8
 """Relative width of the bracket aimed at, and the least that may be asked for."""
@@ -53,6 +54,9 @@ FARTHER = (1e-5, 1e-3, 0.1, 1.0)
 
 COARSE, HALVINGS = 1e-2, 2
 """Relative width down to which the bracket is halved, so often before it is tried to close."""
+
+DODGES = 12
+"""Steps of optimal stopping towards the cells that limit gamma_bar, which only names them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,9 +183,13 @@ def gamma_max(
 
 
 def bracket(
-    lp: StabilizationLP, stop: Stop = never, limit: int = 60, width: float = WIDTH
+    lp: StabilizationLP,
+    stop: Stop = never,
+    limit: int = 60,
+    width: float = WIDTH,
+    start: Growth | None = None,
 ) -> GammaBar:
-    """Enclose gamma_bar of a compiled model; ``stop`` ends the work early."""
+    """Enclose gamma_bar of a compiled model, from a policy; ``stop`` ends the work early."""
     if not lp.n:
         nobody = np.empty(0, dtype=np.int64)
         return GammaBar(0.0, 0.0, nobody, None, None, "no cell is stabilizable")
@@ -190,7 +198,7 @@ def bracket(
         return GammaBar(math.inf, math.inf, certain, None, None, stabilizable=lp.n)
     search = _Search(lp, stop, lp._algorithm_1[1], width)
     with suppress(Stopped):
-        search.run(limit)
+        search.run(limit, start)
     return search.found()
 
 
@@ -231,10 +239,11 @@ class _Search:
     def closed(self) -> bool:
         return self.high <= self.low * (1 + self.width)
 
-    def run(self, limit: int) -> None:
+    def run(self, limit: int, start: Growth | None = None) -> None:
         """Narrow the bracket until it closes, or doubles decide no more."""
-        best = growth.short_lived(self.lp, self.stop)
+        best = start or growth.short_lived(self.lp, self.stop)
         for _ in range(limit):
+            best = growth.improved(self.lp, best, self.stop, least=0.01 * self.width)
             self._raise_low(best)
             if self.stop():
                 return
@@ -336,15 +345,19 @@ def _climbed(lp: StabilizationLP, start: Growth, stop: Stop) -> Growth:
 
 
 def _beyond(
-    lp: StabilizationLP, start: Growth, gamma: float, stop: Stop
+    lp: StabilizationLP, start: Growth, gamma: float, stop: Stop, inside: Bools | None = None
 ) -> Growth | tuple[float, Floats] | None:
     """Decide a gamma: a policy that is stabilizing there, or a proved high and its vector.
 
     Neither where doubles do not decide. The first stopping policy goes on wherever the class of
-    ``start`` does not grow.
+    ``start`` does not grow. With ``inside`` the vector is 0 in all other cells.
     """
     going = start.rate < (1 - 1e-12) / gamma  # gamma may be infinite
-    found = feasibility.optimal_stopping(lp, gamma, np.ones(lp.n), start.pair, going, stop)
+    reward = np.where(going, 1.0, start.x)  # which nothing changes, where no policy is better
+    if inside is not None:
+        reward, going = np.where(inside, reward, 0.0), going & inside
+    limit = 1000 if inside is None else DODGES
+    found = feasibility.optimal_stopping(lp, gamma, reward, start.pair, going, stop, limit)
     if found is None:
         return None
     if not found.refuses:
@@ -375,17 +388,13 @@ def _core(
     needed = check_high(lp, best.slow_vector)
     if needed is not None and needed <= most:
         return best.slow_vector, max(high, needed)
-    reward = np.where(best.slowest & (w_high > 0), 1.0, 0.0)
-    if (reward[w_high > 0] > 0).all():
+    # How far the controls can dodge these classes: they limit nothing if far enough.
+    alone = growth.improved(lp, best, stop, most, inside=best.slowest)
+    if alone.limit > most:
         return w_high, high
-    for gamma in (high, high * (1 + 0.1 * WIDTH)):
-        found = feasibility.optimal_stopping(lp, gamma, reward, stop=stop)
-        if found is None:
-            break
-        core = np.where(reward > 0, found.carried, 0.0)
-        needed = check_high(lp, core) if found.refuses else None
-        if needed is not None and needed <= most:
-            return core, max(high, needed)
+    answer = _beyond(lp, alone, alone.limit * (1 + 0.1 * WIDTH), stop, best.slowest)
+    if isinstance(answer, tuple) and answer[0] <= most:
+        return answer[1], max(high, answer[0])
     return w_high, high
 
 

@@ -11,22 +11,25 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bellman, bounds, linear
+from lmdsl import bellman, bounds, linear, policy
 from lmdsl.directions import Directions
 from lmdsl.forking import cached_property
 from lmdsl.kernels import kernel
-from lmdsl.linear import Stop, never
+from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.sweeps import System
 
 Floats = NDArray[np.float64]
 Pairs = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 TIED = 1e-6
 """Relative difference up to which two classes count as equally slow."""
@@ -37,11 +40,20 @@ LEAST_ENTRY = 1e-250
 SLOWER = 1e-3
 """How much slower than the slowest class one is known to be before its exact rate is left open."""
 
-STEPS = 100
-"""Steps of Noda's iteration, at most."""
+STEPS, FINE = 100, 1e-11
+"""Steps of Noda's iteration, at most, and the relative width at which it ends."""
 
 PASSES = 8
 """Passes over all pairs towards a policy from which runs last least."""
+
+HORIZON = 4
+"""A policy should bring runs home within so many times the steps that it takes with luck."""
+
+REACH = 1e-4
+"""First relative step down to a rate that may be too low; then four times as far each time."""
+
+ROUNDS, COARSE, SLIGHT = 100, 1e-2, 1e-10
+"""Improvements of a policy at most; how well its first rates are known; a relative gain of none."""
 
 SMALLEST, LARGEST = 1e-280, 1e300
 """Range of w."""
@@ -63,6 +75,8 @@ class Growth:
         A positive vector on every class, close to the Perron vector; shape (n,).
     rate
         Upper bound of the spectral radius of the class of every cell, up to rounding, shape (n,).
+    known
+        How well the largest rates are known, relative.
     """
 
     pair: Pairs
@@ -71,6 +85,7 @@ class Growth:
     ends: NDArray[np.int64]
     x: Floats
     rate: Floats
+    known: float
 
     @property
     def limit(self) -> float:
@@ -79,9 +94,9 @@ class Growth:
         return 1 / rate if rate > 0 else math.inf
 
     @property
-    def slowest(self) -> NDArray[np.bool_]:
+    def slowest(self) -> Bools:
         """The cells of the classes that set the limit, shape (n,)."""
-        slowest: NDArray[np.bool_] = self.rate >= self.rate.max() * (1 - TIED)
+        slowest: Bools = self.rate >= self.rate.max() * (1 - TIED)
         return slowest
 
     @cached_property
@@ -90,9 +105,29 @@ class Growth:
         return np.where(self.slowest, self.x, 0.0)
 
 
-def of_policy(lp: StabilizationLP, pair: Pairs, stop: Stop = never) -> Growth:
-    """Take a policy apart into classes and estimate the spectral radius of each."""
+def of_policy(
+    lp: StabilizationLP,
+    pair: Pairs,
+    stop: Stop = never,
+    start: Floats | None = None,
+    enough: float = FINE,
+    inside: Bools | None = None,
+) -> Growth:
+    """Take a policy apart into classes and estimate the spectral radius of each.
+
+    Parameters
+    ----------
+    lp, pair, stop
+        The model, a column per cell, and what ends the work.
+    start, enough
+        A guess of x, and how well the rates have to be known, relative.
+    inside
+        Cells that alone count: runs that leave them end.
+    """
     P = lp.rows.matrix(pair)
+    if inside is not None:
+        P.data[~(inside[P.indices] & np.repeat(inside, np.diff(P.indptr)))] = 0.0
+        P.eliminate_zeros()
     order, ends = linear.classes(P)
     x, rate = np.ones(lp.n), P.diagonal()
     lengths = np.diff(ends, prepend=0)
@@ -101,31 +136,112 @@ def of_policy(lp: StabilizationLP, pair: Pairs, stop: Stop = never) -> Growth:
     for k in several[np.argsort(lengths[several], kind="stable")]:
         cells = np.sort(order[ends[k] - lengths[k] : ends[k]])
         directions = lp.directions.among(cells) if len(cells) >= linear.KRYLOV else None
-        x[cells], rate[cells], least = _perron(P[cells][:, cells], stop, slowest, directions)
+        begin = None if start is None else start[cells]
+        x[cells], rate[cells], least = _perron(
+            P[cells][:, cells], stop, slowest, directions, begin, enough
+        )
         slowest = max(slowest, least)
-    return Growth(pair, P, order, ends, x, rate)
+    return Growth(pair, P, order, ends, x, rate, enough)
 
 
 def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
-    """Return a policy that brings runs home within a few steps, as far as any does.
+    """Return a policy that brings runs home within a few steps, as far as any is known to do.
 
-    From the levels of Algorithm 1, w <- min_a P_a w weighs what has not arrived by then. Where the
-    policy that comes out is no better than the first one, that of the levels, it is that.
+    From the levels of Algorithm 1, w <- min_a P_a w weighs what has not arrived by then. Where runs
+    last under the policy that comes out, as on long ways, the optimum under unit cost, discounted,
+    may be better, or the policy of the levels.
     """
     level, pair = lp._algorithm_1
-    first = of_policy(lp, pair, stop)
-    w, zero = level.astype(np.float64), np.zeros(lp.K)
-    for _ in range(PASSES):
-        if stop():
-            return first
-        done = bellman.improve(lp, w, 1.0, zero)
-        w, pair = done.value, done.pair
-    found = of_policy(lp, pair, stop)
-    return found if found.limit > first.limit else first
+    horizon = float(HORIZON * level.max())
+
+    def candidates() -> Iterator[tuple[Pairs, Floats | None]]:
+        w, zero = level.astype(np.float64), np.zeros(lp.K)
+        for _ in range(PASSES):
+            done = bellman.improve(lp, w, 1.0, zero)
+            w = done.value
+        yield done.pair, None
+        unit, value = np.ones(lp.K), np.full(lp.n, horizon)
+        found = policy.iterate(lp, pair, value, 1 - 1 / horizon, unit, stop=stop)
+        yield found.pair, found.value
+        yield pair, None
+
+    best: Growth | None = None
+    for candidate, start in candidates():
+        one = of_policy(lp, candidate, stop, start, COARSE)
+        if one.limit <= 1 + 1 / horizon:
+            one = of_policy(lp, candidate, stop, one.x, 0.1 / horizon)
+        best = one if best is None or one.limit > best.limit else best
+        if stop() or best.limit > 1 + 1 / horizon:
+            break
+    assert best is not None
+    return best
+
+
+def improved(
+    lp: StabilizationLP,
+    found: Growth,
+    stop: Stop = never,
+    until: float = math.inf,
+    least: float = 1e-2 * TIED,
+    inside: Bools | None = None,
+) -> Growth:
+    """Raise the limit of a policy by Howard's policy iteration.
+
+    A control a with (P_a w)_i < (P_u w)_i keeps P_u w <= lam w, w > 0 being the vector that proves
+    the limit 1/lam: no step lowers it. While the limit still rises fast, the rates need not be
+    known well.
+
+    Parameters
+    ----------
+    lp, found, stop
+        The model, a policy, and what ends the work.
+    until, least
+        A limit that is enough, and the relative gain of a step below which it is the last.
+    inside
+        As in :func:`of_policy`, of which ``found`` then comes.
+    """
+    enough = COARSE
+    with suppress(Stopped):
+        for _ in range(ROUNDS):
+            w = lifted(found)
+            if w is None or stop() or found.limit > until:
+                break
+            new = _greedy(lp, found, w, enough, stop, inside)
+            gain = 0.0 if new is None else new.limit / found.limit - 1
+            if new is not None and gain > 0:
+                found, enough = new, min(enough, max(FINE, 1e-2 * gain))
+            elif found.known <= FINE:
+                break
+            if gain < least and found.known > FINE:
+                found = of_policy(lp, found.pair, stop, found.x, FINE, inside)
+            if 0 < gain < least:
+                break
+    return found
+
+
+def _greedy(
+    lp: StabilizationLP, found: Growth, w: Floats, enough: float, stop: Stop, inside: Bools | None
+) -> Growth | None:
+    """Return the policy that is better for the w of another, None where none is."""
+    w = w if inside is None else np.where(inside, w, 0.0)
+    best = bellman.improve(lp, w, 1.0, np.zeros(lp.K))
+    change = best.value < (found.P @ w) * (1 - SLIGHT)
+    if not change.any():
+        return None
+    pair = np.where(change, best.pair, found.pair)
+    new = of_policy(lp, pair, stop, found.x, enough, inside)
+    if new.limit <= found.limit * (1 + enough):
+        return of_policy(lp, pair, stop, new.x, FINE, inside)
+    return new
 
 
 def _perron(
-    inner: Any, stop: Stop, slowest: float = 0.0, directions: Directions | None = None
+    inner: Any,
+    stop: Stop,
+    slowest: float = 0.0,
+    directions: Directions | None = None,
+    start: Floats | None = None,
+    enough: float = FINE,
 ) -> tuple[Floats, float, float]:
     """Return x > 0, the largest (M x)_i / x_i, and the least, for an irreducible M >= 0.
 
@@ -143,20 +259,25 @@ def _perron(
     slow_fall = 0.1 if directions is None else 0.9
     x = np.ones(n)
     ahead = M @ x
+    if start is not None and (M @ start < float(ahead.max()) * start).all():
+        x = start / start.max()
+        ahead = (M @ x) / x
     top, bottom = float(ahead.max()), float(ahead.min())
-    least, halve = bottom, False
+    least, halve, reach = bottom, False, REACH
     for _ in range(STEPS):
         width = top - bottom
-        if width <= 1e-11 * top or top < slowest * (1 - SLOWER):
+        if width <= enough * top or top < slowest * (1 - SLOWER):
             break
         # A little off top, so that the last steps are not singular.
-        at = (top + bottom) / 2 if halve else top * (1 + 1e-9)
+        middle = max((top + bottom) / 2, top * (1 - reach))
+        at = middle if halve else top * (1 + 1e-9)
         y = _solved(M / at, x, stop, directions)
         if y is None:
             if not halve:
                 break
-            bottom = at
+            bottom, reach = at, 1.0
             continue
+        reach *= 4 if halve else 1
         ahead_y = M @ y
         ratio = ahead_y / y
         least = max(least, float(ratio.min()))
@@ -181,7 +302,10 @@ def _solved(M: Any, x: Floats, stop: Stop, directions: Directions | None) -> Flo
     elif directions is None:
         y = linear.solve(M, x, stop=stop)
     else:
-        y = linear.guess(replace(System.of(M), directions=directions), x, stop)
+        scaled = M.copy()  # all sizes alike, as a Krylov method wants them
+        scaled.data *= x[M.indices] / np.repeat(x, np.diff(M.indptr))
+        y = linear.guess(replace(System.of(scaled), directions=directions), np.ones(len(x)), stop)
+        y = None if y is None else x * y
     if y is None or not np.isfinite(y).all() or not y.min() > 0:
         return None
     y = x + M @ y  # sums of positive numbers: every entry to its own precision
@@ -190,8 +314,15 @@ def _solved(M: Any, x: Floats, stop: Stop, directions: Directions | None) -> Flo
 
 
 def prove_low(lp: StabilizationLP, found: Growth) -> tuple[float, Floats] | None:
-    """Return a proved low of a policy and its w, with the least slack that doubles allow."""
-    P, w, rho = found.P, np.empty(lp.n), float(found.rate.max())
+    """Return a proved low of a policy and its w."""
+    w = lifted(found)
+    low = None if w is None else check_low(lp, found.pair, w)
+    return None if w is None or low is None else (low, w)
+
+
+def lifted(found: Growth) -> Floats | None:
+    """Return w > 0 with P_u w <= lam w, with the least slack that doubles allow."""
+    P, w, rho = found.P, np.empty(len(found.x)), float(found.rate.max())
 
     def fits(power: float) -> bool:
         bound = rho * (1 + 10.0**power)
@@ -205,8 +336,7 @@ def prove_low(lp: StabilizationLP, found: Growth) -> tuple[float, Floats] | None
             power, failed = (middle, failed) if fits(middle) else (power, middle)
         if not fits(power):
             return None
-    low = check_low(lp, found.pair, w)
-    return None if low is None else (low, w)
+    return w
 
 
 def check_low(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:

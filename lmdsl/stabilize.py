@@ -123,11 +123,11 @@ def solve(
                 )
                 return job.restricted(inner, lp.expand(w, 0.0, 0.0))
             job.solve_seconds, job.finish = time.perf_counter() - started, late.again()
-            limits = gamma.bracket(lp, late)
+            limits = gamma.bracket(lp, late, start=first.best)
             bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
             message = gamma.refusal_message(lp, w, limits, bracket)
             return job.refused("gamma", message, verified, bracket)
-        first = feasibility.Undecided(first.pair, first.lower)
+        first = feasibility.Undecided(first.best.pair, first.lower)
     options = Options(
         tolerance=tolerance,
         time_limit=late.left,

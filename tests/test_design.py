@@ -50,7 +50,8 @@ lp
 bellman sums
 screening rational
 bounds
-policy growth
+policy
+growth
 feasibility elimination
 gamma
 backends.base

@@ -15,7 +15,7 @@ from problems import doubling, made, standard_map, steps
 from scipy.sparse.linalg import eigs
 
 import lmdsl as lm
-from lmdsl import gamma, growth, linear
+from lmdsl import feasibility, gamma, growth, linear
 from lmdsl.bounds import exactly_below
 from lmdsl.cli import main
 from lmdsl.directions import Directions
@@ -202,6 +202,71 @@ def test_gamma_near_and_far_beyond_its_limit(cells, g):
     assert not limits.low <= g <= limits.high
     expected = "verified" if g < limits.low else "not_stabilizable"
     assert result.status == expected, result.message
+
+
+def integrator(cells: int, gamma_value: float = 1.0) -> dict:
+    """A double integrator at a short step: transport over many cells, vectors over many decades."""
+    return {
+        "system": {"kind": "double_integrator", "parameters": {"h": 2.4 / cells}},
+        "state_box": {
+            "x": {"low": -2, "high": 2, "cells": cells},
+            "v": {"low": -1.5, "high": 1.5, "cells": cells * 3 // 4},
+        },
+        "attractor": {"points": [{"x": 0, "v": 0}]},
+        "control_grid": {"u": {"low": -1, "high": 1, "points": 5}},
+        "stage_cost": "1",
+        "sampling": {"kind": "grid", "per_axis": 4},
+        "on_exit": "clip",
+        "gamma": gamma_value,
+    }
+
+
+def test_long_ways_take_few_policies(monkeypatch):
+    """Howard's iteration on the vectors of the classes, not hundreds of stopping policies."""
+    lp, calls = lm.compile(made(integrator(60))), []
+    for module, name in ((growth, "of_policy"), (feasibility, "_stopped")):
+        inner = getattr(module, name)
+
+        def counted(*args, inner=inner):
+            calls.append(inner)
+            return inner(*args)
+
+        monkeypatch.setattr(module, name, counted)
+    found = gamma.bracket(lp)
+    assert found.high <= found.low * (1 + 1e-6)
+    assert len(calls) < 90
+    calls.clear()
+    below = lm.solve(replace(lp, gamma=found.low * (1 - 1e-4)))
+    assert below.status == "verified", below.message
+    for far in (found.high * (1 + 1e-4), 5.0):
+        above = lm.solve(replace(lp, gamma=far))
+        assert above.status == "not_stabilizable", above.message
+        assert above.gamma_bar[1] <= above.gamma_bar[0] * (1 + 1e-6)
+    assert len(calls) < 300
+    _check_vectors(lp, found)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_improving_a_policy_never_lowers_its_limit(seed):
+    lp = random_lp(np.random.default_rng(seed), cells=8, controls=4, absorb=0.3)
+    if not lp.n:
+        return
+    first = growth.of_policy(lp, lp.tree[1])
+    better = growth.improved(lp, first)
+    assert better.limit >= first.limit * (1 - 1e-12)
+    proved = growth.prove_low(lp, better)
+    assert proved is not None
+    assert proved[0] <= better.limit * (1 + 1e-12)
+
+
+def test_ended_anywhere_it_keeps_what_is_proved():
+    lp = lm.compile(made(integrator(40)))
+    whole = gamma.bracket(lp)
+    for most in range(0, 300, 23):
+        left = iter(range(most))
+        found = gamma.bracket(lp, stop=lambda left=left: next(left, None) is None)
+        assert found.low <= whole.high
+        assert found.high >= whole.low
 
 
 def test_doubling_map():
