@@ -392,7 +392,9 @@ def _core(
     alone = growth.improved(lp, best, stop, most, inside=best.slowest)
     if alone.limit > most:
         return w_high, high
-    answer = _beyond(lp, alone, alone.limit * (1 + 0.1 * WIDTH), stop, best.slowest)
+    answer = None
+    with suppress(Stopped):
+        answer = _beyond(lp, alone, alone.limit * (1 + 0.1 * WIDTH), stop, best.slowest)
     if isinstance(answer, tuple) and answer[0] <= most:
         return answer[1], max(high, answer[0])
     return w_high, high
