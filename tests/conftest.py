@@ -7,6 +7,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+# Many tests start processes, which need not parse all of lmdsl each time.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # A shell starts what runs in its background with Ctrl-C ignored, and so would the commands that
 # tests interrupt; a handler is not inherited.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
