@@ -8,6 +8,7 @@ own copy of the model. Beyond this module a solution is data, right or wrong.
 from __future__ import annotations
 
 import copy
+import os
 from dataclasses import replace
 from typing import Any
 
@@ -62,7 +63,7 @@ def _ask(
     lp: StabilizationLP, backend: Backend, options: Options
 ) -> tuple[Solution, policy.Iteration | None]:
     asked, kept = lp, None
-    own = backends.ours(backend)
+    own, process = backends.ours(backend), os.getpid()
     try:
         with np.errstate(all="ignore"):  # NumPy's settings are restored
             if backend.capabilities.elimination and options.start is not None:
@@ -71,6 +72,8 @@ def _ask(
             try:
                 found = backend.solve(*((asked, options) if own else _copies(asked, options)))
             finally:
+                if os.getpid() != process:  # a fork that it left running: not to answer as well
+                    os._exit(1)
                 restore_rounding("the backend")
             solution = _plain(asked, found)
             iteration = found.details.get("iteration") if own else None

@@ -97,7 +97,9 @@ class _Diverted:
     def __init__(self) -> None:
         self.kept: int | None = None
         self.file = _file()
-        self.log = io.TextIOWrapper(self.file, "utf-8", "backslashreplace", write_through=True)
+        # foreign code may close what it is given to write to
+        given = os.fdopen(os.dup(self.file.fileno()), "wb", buffering=0)
+        self.log = io.TextIOWrapper(given, "utf-8", "backslashreplace", write_through=True)
         self.streams = {"stdout": sys.stdout, "stderr": sys.stderr}
         self.split: dict[str, _Split] = {}
         try:
@@ -116,13 +118,13 @@ class _Diverted:
         for name, stream in self.streams.items():
             if self.kept is not None and descriptor(stream) == 1:
                 users[name] = twin(stream, os.dup(self.kept))
-            self.split[name] = _Split(stream, users[name], self.log)
+            self.split[name] = _Split(stream, users[name])
             setattr(sys, name, self.split[name])
 
     def end(self) -> None:
         """Put everything back in its place."""
         for name, split in self.split.items():
-            if getattr(sys, name) is split:  # else somebody put another there since
+            if self._is_ours(getattr(sys, name), split):  # else another thread put one there
                 setattr(sys, name, split.stream)
             split.end()
         if self.kept is not None:
@@ -130,8 +132,16 @@ class _Diverted:
             os.dup2(self.kept, 1)
             os.close(self.kept)
             self.kept = None
-        with contextlib.suppress(OSError):
-            self.log.close()
+        for file in (self.log, self.file):
+            with contextlib.suppress(OSError, ValueError):
+                file.close()
+
+    def _is_ours(self, stream: Any, split: _Split) -> bool:
+        """Return whether a standard stream is no use when this ends: whose it is, or was."""
+        if stream is split or stream is None or getattr(stream, "closed", False) is True:
+            return True
+        number = descriptor(stream)
+        return number is not None and _same(number, self.file.fileno())
 
     def size(self) -> int:
         """Return how much was printed."""
@@ -152,32 +162,40 @@ class _Diverted:
 class _Split:
     """Stands for a standard stream: foreign code's goes to the log, the user's to the user."""
 
-    def __init__(self, stream: Any, user: Any, log: Any) -> None:
-        self.stream, self.user, self.log = stream, user, log
+    def __init__(self, stream: Any, user: Any) -> None:
+        self.stream, self.user = stream, user
 
-    def _target(self) -> Any:
-        return self.log if _depth() and self.log is not None else self.user
+    def _target(self) -> tuple[Any, contextlib.AbstractContextManager[None]]:
+        """Return the stream meant, and what to do where it fails."""
+        if _depth() and _diverted is not None:  # no room for the log, or somebody closed it
+            return _diverted.log, contextlib.suppress(OSError, ValueError)
+        return self.user, contextlib.nullcontext()
 
     def write(self, text: str) -> int:
         with _lock:
-            target = self._target()
-            with contextlib.suppress(OSError) if target is self.log else contextlib.nullcontext():
-                return len(text) if target is None else int(target.write(text))
-            return len(text)  # there is no room for the log
+            target, guarded = self._target()
+            if target is not None:
+                with guarded:
+                    return int(target.write(text))
+            return len(text)
 
     def flush(self) -> None:
         with _lock:
-            target = self._target()
+            target, guarded = self._target()
             if target is not None:
-                target.flush()
+                with guarded:
+                    target.flush()
+
+    def close(self) -> None:
+        """Close nothing: the stream stood for is not the caller's."""
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._target(), name)
+        return getattr(self._target()[0], name)
 
     def end(self) -> None:
         """Be the stream stood for from now on: somebody may have kept this object."""
         with _lock:
-            user, self.user, self.log = self.user, self.stream, None
+            user, self.user = self.user, self.stream
             if user is not self.stream:
                 with contextlib.suppress(Exception):
                     user.close()
@@ -188,6 +206,13 @@ def _file() -> Any:
         return tempfile.TemporaryFile(buffering=0)
     except OSError:  # nowhere to write
         return open(os.devnull, "w+b", buffering=0)
+
+
+def _same(one: int, other: int) -> bool:
+    try:
+        return os.path.samestat(os.fstat(one), os.fstat(other))
+    except OSError:
+        return False
 
 
 def _depth() -> int:

@@ -226,6 +226,66 @@ def test_a_notebook(monkeypatch):
     assert set(stream.getvalue().split()) == {"progress"}
 
 
+SPOILT = {
+    "closed": "sys.stdout.close(); sys.stderr.close()",
+    "none": "sys.stdout = sys.stderr = None",
+    "own": "sys.stdout = sys.stderr = open(os.dup(1), 'w')",
+    "rewrapped": "sys.stdout = io.TextIOWrapper(sys.stdout.buffer); sys.stdout = sys.__stdout__",
+    "wrapped": "sys.stdout = io.TextIOWrapper(sys.stdout.buffer)",
+    "detached": "sys.stdout.detach()",
+    "descriptor": "os.close(1)",
+    "elsewhere": "os.chdir('/')",
+    "fork returns": "os.fork() or print('child')",
+    "fork raises": "os.fork() or sys.exit(0)",
+}
+SPOILING = """
+import io, os, sys
+from lmdsl import backends
+
+def solve(lp, options):
+    print("NOISE")
+    {}
+    print("NOISE", flush=True) if sys.stdout else None
+    return backends.get("policy-iteration").solve(lp, options)
+
+BACKEND = backends.Backend("noisy", solve)
+"""
+
+
+@posix
+@pytest.mark.parametrize("how", SPOILT)
+def test_streams_that_a_backend_spoils(tmp_path, noisy, how):
+    (tmp_path / "noisy.py").write_text(SPOILING.format(SPOILT[how]))
+    call = ("-m", "lmdsl", "solve", "problem.json", "--backend", "noisy", "--out", "out", "--json")
+    done = python(tmp_path, noisy, *call)
+    assert json.loads(done.stdout)["status"] == "verified", done.stderr
+    assert done.returncode == 0
+    assert (tmp_path / "out" / "certificate.json").exists()
+    (tmp_path / "spoilt.py").write_text(
+        "import sys, lmdsl as lm\nproblem = lm.load('problem.json')\nprint('before')\n"
+        "for _ in range(2): assert lm.solve(problem, 'noisy').verified\n"
+        "print('after')\nprint('error', file=sys.stderr)\n"
+    )
+    done = python(tmp_path, noisy, "spoilt.py")
+    assert (done.stdout, done.stderr, done.returncode) == ("before\nafter\n", "error\n", 0)
+
+
+def test_a_handler_made_in_one_solve_is_quiet_in_the_next(monkeypatch):
+    stream, kept = Notebook(), []
+    monkeypatch.setattr(sys, "stdout", stream)
+
+    def solve(lp, options):
+        kept.append(sys.stdout)
+        print("NOISE", file=kept[0])
+        return backends.get("policy-iteration").solve(lp, options)
+
+    for _ in range(2):
+        assert lm.solve(made(steps()), backends.Backend("keeping", solve)).log == "NOISE\n"
+    assert stream.getvalue() == ""
+    print("mine", file=kept[0])
+    assert stream.getvalue() == "mine\n"
+
+
 def test_the_contract_suite_prints_nothing_of_a_backend(capfd):
     assert lm.testing.check_backend(shouting(), raise_on_failure=False).checks
     assert capfd.readouterr().out == ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
@@ -60,6 +61,7 @@ def _solve(parsed: Arguments) -> int:
         from lmdsl.saving import refuse_unless_free
 
         refuse_unless_free(parsed.out)
+        parsed.place = Path(parsed.out).absolute()  # a solver may change the current directory
     problem = _problem(parsed)
     from lmdsl.stabilize import solve
 
@@ -97,9 +99,9 @@ def _saved(result: Any, parsed: Arguments) -> int:
     from lmdsl.archive import rescue
 
     try:
-        result.save(parsed.out)
+        result.save(parsed.place)
     except (LmdslError, MemoryError) as error:
-        found = rescue(result, parsed.out)
+        found = rescue(result, parsed.place)
         where = "nothing was saved" if found is None else f"the result was saved in {found}"
         print(printable(f"lmdsl: {str(error) or 'out of memory'}; {where}"), file=sys.stderr)
         return 2
