@@ -19,10 +19,15 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from lmdsl import forking
+
 KEPT = 65_536
 """Bytes of a log that are kept, the last ones."""
 
 _lock = threading.RLock()
+_turn = threading.RLock()
+"""Held while the streams are diverted or put back: no fork may happen in the middle."""
+forking.hold(_turn)
 _here = threading.local()
 _diverted: _Diverted | None = None
 _users = 0
@@ -221,7 +226,7 @@ def _depth() -> int:
 
 def _enter() -> _Diverted:
     global _diverted, _users
-    with _lock:
+    with _turn, _lock:
         if _diverted is None:
             _diverted = _Diverted()
         _users += 1
@@ -230,7 +235,7 @@ def _enter() -> _Diverted:
 
 def _leave() -> None:
     global _diverted, _users
-    with _lock:
+    with _turn, _lock:
         _users -= 1
         if not _users and _diverted is not None:
             _diverted.end()

@@ -12,6 +12,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from lmdsl import kernels
@@ -71,7 +72,9 @@ def each(work: Callable[[Part], Outcome], parts: Sequence[Part]) -> list[Outcome
             deque(left, maxlen=0)
 
     pool = _shared(helpers)
-    others = [pool.submit(pull) for _ in range(helpers)]
+    others: list[Future[None]] = []
+    with suppress(RuntimeError):  # the main thread has ended, and with it the pool
+        others.extend(pool.submit(pull) for _ in range(helpers))
     try:
         pull()
     finally:
@@ -110,7 +113,7 @@ def in_order(
     try:
         for part in parts:
             if sum(not future.done() for future in ahead) < 2 * helpers:
-                ahead.append(pool.submit(work, part))
+                ahead.append(_begun(pool, work, part))
             else:
                 ahead.append(_done(work, part))
             while ahead and (ahead[0].done() or len(ahead) > 8 * helpers):
@@ -122,6 +125,15 @@ def in_order(
         raise
     finally:
         wait([future for future in ahead if not future.cancel()])
+
+
+def _begun(
+    pool: ThreadPoolExecutor, work: Callable[[Part], Outcome], part: Part
+) -> Future[Outcome]:
+    try:
+        return pool.submit(work, part)
+    except RuntimeError:  # the main thread has ended, and with it the pool
+        return _done(work, part)
 
 
 def _done(work: Callable[[Part], Outcome], part: Part) -> Future[Outcome]:

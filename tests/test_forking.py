@@ -45,6 +45,7 @@ def run(script):
         capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
+    return done.stderr
 
 
 @pytest.mark.parametrize("backend", ["clarabel", "clarabel:dual", "cvxpy:clarabel", "highs:ipx"])
@@ -189,3 +190,49 @@ def test_forks_while_other_threads_solve(backend):
     for thread in threads:
         thread.join()
     """)
+
+
+def test_a_fork_while_another_thread_puts_the_streams_back():
+    run("""
+    import time
+    from lmdsl import quiet
+    close, begun = os.close, threading.Event()
+
+    def slow(number):
+        close(number)
+        begun.set()
+        time.sleep(0.3)
+
+    def work():
+        with quiet.foreign():
+            os.close = slow
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    begun.wait()
+    os.close = close
+
+    def again():
+        with quiet.foreign() as printed:
+            print("NOISE")
+        assert printed() == "NOISE\\n"
+
+    ended(fork(again))
+    thread.join()
+    again()
+    """)
+
+
+def test_a_thread_that_outlives_the_main_one_solves():
+    said = run("""
+    p = problem(30)
+    cost = lm.solve(p).cost
+
+    def work():
+        threading.main_thread().join()
+        assert lm.solve(p).cost == cost
+        os.write(2, b"solved")
+
+    threading.Thread(target=work).start()
+    """)
+    assert said == "solved"
