@@ -209,8 +209,13 @@ class _KindsOfFiles:
 
     def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
         schema: dict[str, Any] = handler(core)
-        kinds = [one for one in schema["oneOf"] if handler.resolve_ref_schema(one) != {"not": {}}]
+        kinds = [one for one in schema["oneOf"] if not _is_function(one)]
         return {**schema, "oneOf": kinds}
+
+
+def _is_function(schema: dict[str, Any]) -> bool:
+    """Return whether a schema, or what it refers to and may not be made yet, is a function's."""
+    return schema == {"not": {}} or FunctionSystem.__name__ in schema.get("$ref", "")
 
 
 def _json_kinds(value: Any) -> Any:

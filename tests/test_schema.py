@@ -247,6 +247,34 @@ def test_bounds_of_the_models_are_in_it(schema):
         assert not validator.is_valid({**steps(), key: value}), (key, value)
 
 
+class Own(pydantic.BaseModel):
+    """Somebody's model of the name of one of ours, that holds problems more than once."""
+
+    first: lm.Problem
+    others: list[lm.Problem] | None = None
+    next: "Own | None" = None
+
+
+class MapSystem(Own):
+    pass
+
+
+@pytest.mark.parametrize("mode", ["validation", "serialization"])
+@pytest.mark.parametrize("held", [Own, MapSystem, list[lm.Problem], dict[str, lm.Problem],
+                                  lm.Problem | MapSystem, lm.Problem])  # fmt: skip
+def test_a_problem_held_several_times(held, mode):
+    found = pydantic.TypeAdapter(held).json_schema(mode=mode)
+    Draft202012Validator.check_schema(found)
+    assert "FunctionSystem" not in json.dumps(found)
+    validator, good, bad = Draft202012Validator(found), standard_map(), standard_map(gamma=0)
+    wrap = {list[lm.Problem]: lambda p: [p], dict[str, lm.Problem]: lambda p: {"a": p}}.get(
+        held, lambda p: p if "Problem" in str(held) else {"first": good, "others": [p]}
+    )
+    if mode == "validation":
+        assert validator.is_valid(wrap(good))
+    assert not validator.is_valid(wrap(bad))
+
+
 def test_models_that_embed_a_problem():
     class Study(pydantic.BaseModel):
         problem: lm.Problem
