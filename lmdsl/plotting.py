@@ -10,6 +10,7 @@ touching matplotlib's global state: ``ax.figure.savefig(...)``.
 
 from __future__ import annotations
 
+import math
 import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lmdsl import inputs
+from lmdsl import inputs, memory
 from lmdsl.drawing import layers, runs
 from lmdsl.drawing.view import At, Floats, View, number, plain
 from lmdsl.errors import BadInput, shown
@@ -40,6 +41,8 @@ if TYPE_CHECKING:
     from lmdsl.explanation import Explanation
     from lmdsl.result import Result
 
+PAGE = 2e8
+"""Bytes for a page as pixels, and for matplotlib."""
 FORMATS = ("png", "pdf", "svg")
 
 
@@ -402,6 +405,7 @@ def figure(
         draw.append(lambda ax: measure(result, ax, axes=axes, at=at))
         draw.append(lambda ax: trajectories(result, ax, seed=seed, axes=axes, at=at))
     draw.append(lambda ax: _numbers(ax, result))
+    memory.require(_bytes(view, 300 + 60 * len(draw)) + PAGE, "plots")
     columns = min(len(draw), 3)
     rows = -(-len(draw) // columns)
     page: Figure = layers.blank(columns, rows)
@@ -430,7 +434,15 @@ def _result() -> type[Result]:
 
 def _view(result: Result, axes: Sequence[str] | None, at: At | None) -> View:
     inputs.kind(result, _result(), "result", "a Result")
-    return View.of(result.partition, result.cell_status == CellStatus.ATTRACTOR, axes, at)
+    view = View.of(result.partition, result.cell_status == CellStatus.ATTRACTOR, axes, at)
+    memory.require(_bytes(view, 150), "a plot")
+    return view
+
+
+def _bytes(view: View, each: int) -> float:
+    """Return the memory of a plot that takes so many bytes for a cell that is shown."""
+    shape = view.partition.shape
+    return each * math.prod(shape[k] for k in view.axes) + 40.0 * math.prod(shape)
 
 
 def _on_stabilized(result: Result, values: Floats) -> Floats:

@@ -252,7 +252,7 @@ class Own(pydantic.BaseModel):
 
     first: lm.Problem
     others: list[lm.Problem] | None = None
-    next: "Own | None" = None
+    next: Own | None = None
 
 
 class MapSystem(Own):
