@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import os
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +15,7 @@ import pytest
 from problems import doubling, made, standard_map
 
 import lmdsl as lm
-from lmdsl import plotting
+from lmdsl import memory, plotting
 from lmdsl.drawing import layers, runs
 from lmdsl.drawing.view import View, number, plain, rectangles, segments
 from lmdsl.errors import MissingDependency
@@ -537,3 +539,47 @@ def test_a_million_cells_are_drawn_in_bounded_work():
     ax.get_figure().canvas.draw()
     assert len(ax.images) == 2  # too many runs for outlines: regions become images
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["escapes"]
+
+
+@pytest.mark.parametrize("draw", [lm.plotting.figure, lm.plotting.cost, lm.plotting.measure])
+def test_a_plot_that_does_not_fit_is_refused(monkeypatch, draw):
+    result = lm.solve(made(standard_map(400, 1.0)))
+    monkeypatch.setattr(memory, "available", lambda: memory.Room(2**24, "a test"))
+    with pytest.raises(lm.BadInput, match=r"plots?\) and 16\.8 MB are available \(a test\)"):
+        draw(result)
+
+
+PEAK = """
+import lmdsl as lm
+from lmdsl import memory, plotting
+
+def peak():
+    lines = open("/proc/self/status").read().splitlines()
+    return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM"))
+
+asked, require = [0], memory.require
+memory.require = lambda estimate, what: (asked.append(estimate), require(estimate, what))
+result = lm.Result.load("out")
+before, asked[:] = peak(), [0]
+plotting.figure(result, "a.{}")
+print(peak() - before, max(asked))
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not os.path.exists("/proc/self/status"), reason="Linux")
+@pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
+def test_the_estimate_of_a_plot_is_an_upper_bound(tmp_path, kind):
+    data = standard_map(900, 1.0)
+    scattered = {"x": "0.9*x + 2*max(0, sin(1e6*x*y + 1e5*x))", "y": "0.9*y"}
+    data["system"] = {"kind": "map", "next": scattered}
+    data["state_box"] = {k: {"low": -1, "high": 1, "cells": 900} for k in "xy"}
+    data["attractor"] = {"boxes": [{"x": [-0.1, 0.1], "y": [-0.1, 0.1]}]}
+    data["stage_cost"] = "1"
+    data["control_grid"], data["sampling"] = {"u": {"values": [0]}}, {"kind": "grid", "per_axis": 1}
+    lm.solve(made(data)).save(tmp_path / "out")
+    done = subprocess.run([sys.executable, "-c", PEAK.format(kind)], cwd=tmp_path, check=True,
+                          env={**os.environ, "PYTHONPATH": str(Path(lm.__file__).parents[1])},
+                          capture_output=True, text=True, timeout=600)  # fmt: skip
+    taken, estimate = map(float, done.stdout.split())
+    assert taken < estimate < 4 * taken
