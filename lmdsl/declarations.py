@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import (
     BeforeValidator,
+    ConfigDict,
     Discriminator,
     Field,
     Tag,
@@ -296,6 +297,15 @@ class Attractor(Declared):
         Multi-indices of cells.
     """
 
+    model_config = ConfigDict(
+        json_schema_extra={
+            "anyOf": [
+                {"required": [key], "properties": {key: {"not": {"maxItems": 0}}}}
+                for key in ("points", "boxes", "cells")
+            ]
+        }
+    )
+
     points: Points = ()
     boxes: Boxes = ()
     cells: CellIndices = ()
@@ -325,6 +335,13 @@ class Measure(Declared):
     weights
         One number >= 0 per cell, C order, instead of a density.
     """
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "anyOf": [{"required": [key]} for key in ("boxes", "density", "weights")],
+            "not": {"required": ["density", "weights"]},
+        }
+    )
 
     boxes: SomeBoxes | None = None
     density: FormulaText | None = None

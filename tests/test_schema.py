@@ -181,8 +181,12 @@ def walk(schema, root, data, path=()):
         schema = {**at(root, schema["$ref"].split("/")[1:]), **schema}
     yield schema, path
     value = data
-    for part in [*schema.get("oneOf", ()), *schema.get("anyOf", ())]:
-        if Draft202012Validator({**part, "$defs": root["$defs"]}).is_valid(value):
+    parts = [
+        part for part in [*schema.get("oneOf", ()), *schema.get("anyOf", ())]
+        if Draft202012Validator({**part, "$defs": root["$defs"]}).is_valid(value)
+    ]  # fmt: skip
+    for part in parts:
+        if len(parts) == 1 or "type" in part or "$ref" in part:  # else another keeps it valid
             yield from walk(part, root, value, path)
     if isinstance(value, dict):
         for key, inner in value.items():
@@ -291,6 +295,23 @@ def test_models_that_embed_a_problem():
     assert lm.Problem.model_json_schema()["required"] == json_schema()["required"]
     for _, place in places(found):
         assert set(place) <= WORDS
+
+
+@pytest.mark.parametrize("key", ["attractor", "measure"])
+@pytest.mark.parametrize("value", [
+    {}, {"points": []}, {"points": [], "boxes": [], "cells": []}, {"points": [], "cells": [[0]]},
+    {"boxes": [{"x": [0, 0.3]}]}, {"boxes": []}, {"boxes": None}, {"density": None},
+    {"boxes": None, "density": "x", "weights": None}, {"density": "x", "weights": [1, 1, 1, 1]},
+    {"weights": [1, 1, 1, 1]}, {"points": [[0.1]]}, {"cells": [[0]]}, {"cells": None},
+])  # fmt: skip
+def test_one_of_several_keys_is_needed(schema, key, value):
+    data = steps(**{key: value})
+    try:
+        lm.Problem.model_validate_json(json.dumps(data))
+        taken = True
+    except lm.BadInput:
+        taken = False
+    assert Draft202012Validator(schema).is_valid(data) == taken
 
 
 def test_the_key_of_editors():
