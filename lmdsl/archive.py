@@ -25,11 +25,12 @@ from lmdsl.certificate import CLAIMS, Certificate
 from lmdsl.errors import BadInput, shown
 from lmdsl.files import MAX_FILE_BYTES, parsed, reason
 from lmdsl.folder import FORMAT, Reading
+from lmdsl.json_values import jsonable
 from lmdsl.local_check import LocalCheck
 from lmdsl.lp import StabilizationLP
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem, parse_problem
-from lmdsl.result import ARRAYS, EXIT, Report, Result, Seconds, jsonable
+from lmdsl.result import ARRAYS, EXIT, Report, Result, Seconds
 from lmdsl.sampling import control_count, control_vectors
 from lmdsl.systems import FunctionSystem
 from lmdsl.systems.base import NotStored
@@ -73,13 +74,13 @@ def rescue(result: Result, path: str | os.PathLike[str]) -> Path | None:
     name = Path(path).name or "out"
     for home in (tempfile.gettempdir, os.getcwd, Path.home):
         with contextlib.suppress(OSError, RuntimeError, MemoryError, BadInput):
-            folder = Path(tempfile.mkdtemp(prefix="lmdsl-", dir=home()))
+            place = Path(tempfile.mkdtemp(prefix="lmdsl-", dir=home()))
             try:
-                save(result, folder / name)
+                save(result, place / name)
             except BaseException:
-                folder.rmdir()
+                place.rmdir()
                 raise
-            return folder / name
+            return place / name
     return None
 
 

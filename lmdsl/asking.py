@@ -23,8 +23,7 @@ from lmdsl.errors import BadInput, MissingDependency, plain_text
 from lmdsl.frozen import freeze
 from lmdsl.lp import StabilizationLP
 from lmdsl.surroundings import restore_rounding
-
-Pairs = NDArray[np.int64]
+from lmdsl.types import Pairs
 
 MOST_ITERATIONS = 2**53
 """A larger number of iterations is no count, and no number that JSON keeps."""

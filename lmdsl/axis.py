@@ -12,9 +12,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.kernels import fixed, kernel
+from lmdsl.types import Floats
 
 EDGE = 1e-9
 """Width of an edge in cells: points this close to an edge count as lying on it."""
@@ -23,8 +23,6 @@ MOST_TURNS = 2.0**20
 """Turns away from a circle beyond which an image counts as out: its place is rounding error."""
 
 ROUNDING = 2.0**-53
-
-Floats = NDArray[np.float64]
 
 
 class Axis(NamedTuple):

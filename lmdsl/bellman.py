@@ -5,24 +5,15 @@ One compiled loop per idea. Vectors over C carry one more entry, 0, for the attr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import threads
-from lmdsl.kernels import kernel
+from lmdsl.kernels import ONE, kernel
 from lmdsl.lp import StabilizationLP
-from lmdsl.sweeps import ONE
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
-T = TypeVar("T")
-
-GRAIN = 500_000
-"""Transitions that are worth a thread."""
+from lmdsl.types import Floats, Pairs
+from lmdsl.vectors import over_cells, padded
 
 IN_PLACE = 4
 """Ranges of a pass in which a cell sees the new values of its own range only: few, to see much."""
@@ -42,24 +33,6 @@ class Improvement:
 
     value: Floats
     pair: Pairs
-
-
-def padded(V: Floats) -> Floats:
-    """Append the attractor's 0."""
-    return np.append(np.asarray(V, dtype=np.float64), 0.0)
-
-
-def over_cells(
-    lp: StabilizationLP, part: Callable[[tuple[int, int]], T], most: int = 16
-) -> list[T]:
-    """Call ``part`` on ranges of cells that cover C, in several threads where that pays.
-
-    The ranges, ``most`` at most, do not depend on the number of threads; nor do the results.
-    """
-    count = max(1, min(len(lp.rows.target) // GRAIN, most, lp.n))
-    if count == 1:
-        return [part((0, lp.n))]
-    return threads.each(part, threads.ranges(lp.n, count))
 
 
 def improve(

@@ -13,19 +13,13 @@ from __future__ import annotations
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.bellman import improve, over_cells, padded
-from lmdsl.kernels import kernel
-from lmdsl.linear import Stop, never
+from lmdsl.kernels import ONE, kernel
 from lmdsl.lp import StabilizationLP
 from lmdsl.sums import LEAST as LEAST
 from lmdsl.sums import UNIT as UNIT
-from lmdsl.sums import rounded_down
-from lmdsl.sweeps import ONE
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
+from lmdsl.types import Floats, Pairs
+from lmdsl.vectors import over_cells, padded
 
 LARGEST = 2.0**1000
 """No sum above is believed: one that rounds to infinity would be above everything."""
@@ -81,26 +75,6 @@ def add_above(a: Floats, b: Floats) -> Floats:
         return np.where((a == 0) | (b == 0), total, total * (1 + 4 * UNIT))
 
 
-def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Floats:
-    """Return a lower bound of min_a gamma P_a x + G_a, shape (n,); ``cost`` None means 0."""
-    if cost is None and ordinary(lp, x, gamma, None):  # the margin of the longest row for all
-        terms = int(np.diff(lp.rows.pointer).max(initial=0)) + 8
-        least: Floats = improve(lp, x, gamma, np.zeros(lp.K)).value
-        return least * (1 - terms * UNIT) * (1 - 4 * UNIT)
-    lower, V = np.empty(lp.n), padded(x)
-    cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
-
-    def part(cells: tuple[int, int]) -> None:
-        given = (*cells, *lp.kernel, gamma, cost, V, lower)
-        if plain:
-            _below(*given)
-        else:
-            _carefully(*given, NO_PAIRS)
-
-    over_cells(lp, part)
-    return lower
-
-
 def holds_for_all(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> bool:
     """Decide x <= gamma P_a x + G_a for every pair; False also where it cannot be decided."""
     open_pairs = undecided(lp, x, gamma, cost)
@@ -143,55 +117,6 @@ def exactly_below(
 ) -> bool:
     """Decide x <= gamma P_a x + G_a of one pair in exact arithmetic."""
     return Fraction(float(x[lp.cell[k]])) <= exact_backup(lp, k, x, gamma, cost)
-
-
-def lower_until_below(
-    lp: StabilizationLP,
-    x: Floats,
-    gamma: float,
-    cost: Floats | None,
-    sweeps: int = 60,
-    stop: Stop = never,
-) -> Floats | None:
-    """Lower x until x <= gamma P_a x + G_a holds for every pair; None where it does not settle.
-
-    Only components that break the inequality move, each to a rounded-down right-hand side. The
-    right-hand side is monotone in x, so nothing that holds is broken by more than it is lowered.
-    """
-    x = x.copy()
-    for _ in range(sweeps):
-        if stop():
-            break
-        open_pairs = undecided(lp, x, gamma, cost)
-        if open_pairs is None:
-            x = np.minimum(x, backup_below(lp, x, gamma, cost))
-            continue
-        lowered = False
-        for k in open_pairs:
-            i = int(lp.cell[k])
-            bound = exact_backup(lp, int(k), x, gamma, cost)
-            if Fraction(float(x[i])) > bound:
-                x[i] = rounded_down(bound)
-                lowered = True
-        if not lowered:
-            return x
-    return None
-
-
-def raise_from_zero(
-    lp: StabilizationLP, gamma: float, cost: Floats, sweeps: int, stop: Stop = never
-) -> Floats:
-    """Return value iterates from 0, rounded down: x <= T x holds along the whole way.
-
-    x_{k+1} = max(x_k, rounded-down T x_k) <= T x_k <= T x_{k+1}, as T is monotone.
-    """
-    x = np.zeros(lp.n)
-    for _ in range(sweeps):
-        y = np.maximum(x, backup_below(lp, x, gamma, cost))
-        if stop() or np.all(y - x <= 1e-12 * y):
-            return y
-        x = y
-    return x
 
 
 def ordinary(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> bool:
@@ -293,22 +218,6 @@ def _carefully_above(first, last, pair, pointer, target, code, share, gamma, V, 
         q, relative, absolute = _product(pair[i], pointer, target, code, share, V)
         future = gamma * (q * (1.0 + relative) + absolute)
         upper[i] = 0.0 if absolute == 0.0 else future * (1.0 + 4.0 * UNIT) + 2.0 * LEAST
-
-
-@kernel
-def _below(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, lower
-):
-    for i in range(np.uint64(first), np.uint64(last)):
-        best = np.inf
-        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
-            g = cost[k] if len(cost) else 0.0
-            q = 0.0
-            for e in range(pointer[k], pointer[k + ONE]):
-                q += share[code[e]] * V[target[e]]
-            below = _plain(pointer[k + ONE] - pointer[k], q, gamma, g)
-            best = below if below < best else best
-        lower[i] = best
 
 
 @kernel

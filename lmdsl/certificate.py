@@ -23,14 +23,11 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl import bounds, policy, rational, sums, threads
+from lmdsl import bounds, rational, reachability, sums, threads
 from lmdsl.lp import StabilizationLP
 from lmdsl.sums import rounded_up, total_above
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
+from lmdsl.types import Floats, Pairs
 
 MEASURE_TOLERANCE = 1e-9
 MOST_EXACT = 200_000
@@ -324,7 +321,7 @@ def _too_small(cost: float | None) -> str:
 
 
 def _not_stabilizing(lp: StabilizationLP, pair: Pairs) -> str:
-    lost = int((~policy.reaches_attractor(lp, pair)).sum())
+    lost = int((~reachability.reaches_attractor(lp, pair)).sum())
     if lost and lp.gamma < 1:
         return (
             f"from {lost} of {lp.n} cells the policy never reaches the attractor: at gamma = "

@@ -17,7 +17,7 @@ from lmdsl.problem import Problem
 from lmdsl.result import Result
 from lmdsl.stabilize import TOLERANCE, not_compiled, solve
 from lmdsl.surroundings import own_arithmetic
-from lmdsl.transitions import Progress
+from lmdsl.types import Progress
 
 BACKENDS = ("policy-iteration", "highs", "clarabel", "cvxpy")
 """Compared where none is named: those that every installation has."""

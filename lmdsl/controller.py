@@ -19,9 +19,7 @@ from lmdsl.partition import Partition
 from lmdsl.problem import ConstantControl, Problem
 from lmdsl.sampling import noise_nodes
 from lmdsl.surroundings import own_arithmetic
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from lmdsl.types import Floats, Indices
 
 REACHED, LOST, CYCLING = 0, 1, 2
 FOREVER = Deadline()

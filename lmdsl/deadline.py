@@ -71,3 +71,7 @@ class Deadline:
     def cancel(self) -> None:
         """End the work now: the caller was interrupted, and threads that help need not go on."""
         self._at = -math.inf
+
+
+class Stopped(Exception):
+    """The caller's time is up: no answer, which is not the same as no solution."""

@@ -20,18 +20,16 @@ from lmdsl.declared import (
     Box,
     Count,
     Declared,
-    FormulaText,
     Number,
     Numbers,
     Positive,
     SchemaWords,
     Seed,
     frozen_dict,
-    named_keys,
     plain,
-    valid_names,
 )
 from lmdsl.errors import BadInput
+from lmdsl.names import FormulaText, named_keys, valid_names
 from lmdsl.systems import NAMED, FunctionSystem, MapSystem, OdeSystem, System
 
 MAX_AXES = 16

@@ -19,7 +19,6 @@ from pydantic import (
 from lmdsl.errors import BadInput
 from lmdsl.faults import condensed
 from lmdsl.files import strict_json
-from lmdsl.formulas import MAX_CHARACTERS, MAX_NAME, RESERVED, check_name
 
 _K = TypeVar("_K")
 _V = TypeVar("_V")
@@ -55,12 +54,6 @@ def plain(value: Any) -> Any:
     return value
 
 
-def _named(value: dict[str, Any]) -> dict[str, Any]:
-    for name in value:
-        check_name(name)
-    return value
-
-
 @dataclass(frozen=True, eq=False)
 class SchemaWords:
     """Adds words to the JSON Schema of a type, for what only Python code checks."""
@@ -88,36 +81,9 @@ Seed = Annotated[int, Field(strict=True, ge=0, lt=2**63), BeforeValidator(plain)
 Numbers = Annotated[tuple[Number, ...], Field(fail_fast=True, min_length=1), BeforeValidator(plain)]
 """A sequence of finite doubles, at least one."""
 
-FormulaText = Annotated[str, SchemaWords({"minLength": 1, "maxLength": MAX_CHARACTERS})]
-"""A text formula; the model that knows its names parses it."""
 
 frozen_dict = AfterValidator(FrozenDict)
-valid_names = AfterValidator(_named)
-named_keys = SchemaWords(
-    {
-        "propertyNames": {
-            "pattern": "^[A-Za-z_][A-Za-z0-9_]*$",
-            "maxLength": MAX_NAME,
-            "not": {"enum": sorted(RESERVED)},
-        }
-    }
-)
-"""What `valid_names` asks for, in words of JSON Schema."""
 
-Parameters = Annotated[
-    dict[str, Number],
-    Field(max_length=1000),
-    BeforeValidator(plain),
-    valid_names,
-    named_keys,
-    frozen_dict,
-]
-"""Named constants of a system."""
-
-Formulas = Annotated[
-    dict[str, FormulaText], BeforeValidator(plain), valid_names, named_keys, frozen_dict
-]
-"""One formula per state."""
 
 Interval = Annotated[tuple[Number, Number], BeforeValidator(plain)]
 Box = Annotated[dict[str, Interval], BeforeValidator(plain), frozen_dict]

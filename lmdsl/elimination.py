@@ -9,14 +9,10 @@ the same optimum. What it answers is certified over all pairs all the same.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl import bellman, policy
-from lmdsl.linear import Stop, never
 from lmdsl.lp import StabilizationLP
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
+from lmdsl.types import Floats, Pairs, Stop, never
 
 STEPS, PASSES = 3, 60
 LEAST_RISE = 1e-3

@@ -15,8 +15,8 @@ from lmdsl.certificate import (
     with_stated_gap,
 )
 from lmdsl.lp import StabilizationLP
-from lmdsl.program import Check
 from lmdsl.sums import LARGEST, rounded_down, rounded_up
+from lmdsl.types import Check
 
 
 def check_exactly(

@@ -25,7 +25,8 @@ from lmdsl.phase_one import PhaseOne
 from lmdsl.problem import Problem
 from lmdsl.sampler import Sampler
 from lmdsl.surroundings import own_arithmetic
-from lmdsl.transitions import Progress, Transitions, assemble
+from lmdsl.transitions import Transitions, assemble
+from lmdsl.types import Progress
 
 LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
 MEANING = {

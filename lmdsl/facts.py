@@ -12,9 +12,9 @@ from lmdsl import boxes
 from lmdsl.boxes import Ends, Region
 from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus
+from lmdsl.json_values import jsonable
 from lmdsl.kernels import kernel
 from lmdsl.partition import Partition
-from lmdsl.result import jsonable
 from lmdsl.rows import Rows
 from lmdsl.sampler import Block, Sampler
 from lmdsl.transitions import outcome

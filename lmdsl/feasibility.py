@@ -7,17 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl import bellman, bounds, growth, linear
-from lmdsl.linear import Stop, Stopped, never
+from lmdsl.deadline import Stopped
 from lmdsl.lp import StabilizationLP
 from lmdsl.policy import iterate, peeled, stability_vector
 from lmdsl.sweeps import TOLERANCE
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from lmdsl.types import Bools, Floats, Pairs, Stop, never
 
 SWEEPS, MOST_ROUNDS = 30, 8
 """Sweeps after which a proof is given up unless they moved it much less than the ones before."""

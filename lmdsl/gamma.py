@@ -26,25 +26,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl import bounds, feasibility, growth, inputs, policy
+from lmdsl import bounds, descent, feasibility, growth, inputs, policy
 from lmdsl.boxes import Area
-from lmdsl.deadline import Deadline
+from lmdsl.deadline import Deadline, Stopped
 from lmdsl.errors import BadInput, shown
 from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus
 from lmdsl.growth import Growth
 from lmdsl.kernels import kernel
-from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
 from lmdsl.surroundings import own_arithmetic
-from lmdsl.transitions import Progress
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from lmdsl.types import Bools, Floats, Pairs, Progress, Stop, never
 
 WIDTH, LEAST_WIDTH = 1e-6, 1e-8
 """Relative width of the bracket aimed at, and the least that may be asked for."""
@@ -313,7 +307,7 @@ def check_high(lp: StabilizationLP, w: Floats) -> float | None:
     """Return the least high (rounded up) with w <= high P_a w for all pairs, None if none is."""
     if not (np.isfinite(w).all() and (w >= 0).all() and (w > 0).any()):
         return None
-    ahead = bounds.backup_below(lp, w, 1.0, None)
+    ahead = descent.backup_below(lp, w, 1.0, None)
     on = w > 0
     if (ahead[on] <= 0).any():
         return None

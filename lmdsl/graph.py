@@ -27,9 +27,8 @@ from numpy.typing import NDArray
 
 from lmdsl import memory, threads
 from lmdsl.deadline import Deadline
-from lmdsl.kernels import fixed, kernel
+from lmdsl.kernels import ONE, fixed, kernel
 from lmdsl.rows import Rows
-from lmdsl.sweeps import ONE
 from lmdsl.transitions import Transitions
 
 

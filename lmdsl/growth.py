@@ -20,16 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import bellman, bounds, linear, policy
+from lmdsl.deadline import Stopped
 from lmdsl.directions import Directions
 from lmdsl.forking import cached_property
 from lmdsl.kernels import kernel
-from lmdsl.linear import Stop, Stopped, never
 from lmdsl.lp import StabilizationLP
 from lmdsl.sweeps import System
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from lmdsl.types import Bools, Floats, Pairs, Stop, never
 
 TIED = 1e-6
 """Relative difference up to which two classes count as equally slow."""

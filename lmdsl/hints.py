@@ -29,17 +29,16 @@ from numpy.typing import NDArray
 
 from lmdsl.axis import EDGE
 from lmdsl.graph import CellStatus
-from lmdsl.result import jsonable
+from lmdsl.json_values import jsonable
 from lmdsl.sampler import CHUNK, Sampler
 from lmdsl.sampling import control_values
+from lmdsl.types import Bools, Floats
 
 STEPS, NEAR, SUPPORT, QUANTILE = 64, 0.25, 0.05, 0.9
 MOST_CELLS, MOST_CONTROLS, MOST_POINTS, MOST_NODES = 512, 64, 16, 4
 BEYOND = (0.0, 0.125, 0.25, 0.5, 1.0)
 """How far beyond the end of a control's range is tried, in lengths of the range."""
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Cells = NDArray[np.int64]
 
 

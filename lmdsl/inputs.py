@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.errors import BadInput, shown
-
-Floats = NDArray[np.float64]
+from lmdsl.types import Floats
 
 MOST = 10**15
 """The largest count that is accepted: exact as a double, and more than anybody waits for."""

@@ -14,9 +14,8 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lmdsl.types import Floats
 
 ROUNDING: Final = 2.0**-53
 """Relative error of a correctly rounded operation."""

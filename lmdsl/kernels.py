@@ -263,3 +263,6 @@ def _code(code: CodeType) -> Iterator[bytes]:
             yield from _code(value)
         else:
             yield repr(value).encode()
+
+
+ONE = np.uint64(1)

@@ -7,11 +7,9 @@ as every component allows: down to just above the solution of x = b + M x, or up
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.sweeps import CEILING, System
-
-Floats = NDArray[np.float64]
+from lmdsl.types import Floats
 
 SWEEPS, STEPS = 4, 16
 LEAST_FALL, FARTHEST = 1e-10, 1e4

@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import leaps
+from lmdsl.deadline import Stopped
 from lmdsl.kernels import kernel
 from lmdsl.peeling import Peeled
 from lmdsl.sweeps import CEILING, NEVER, TOLERANCE, System
-
-Floats = NDArray[np.float64]
+from lmdsl.types import Floats, Stop, never
 
 TRIAL_SWEEPS = 60
 MAX_SWEEPS = 200_000
@@ -41,17 +41,6 @@ PER_CORE = 20
 
 _filtering = threading.Lock()
 """Filters of warnings belong to the process: one thread at a time changes and restores them."""
-
-Stop = Callable[[], bool]
-
-
-class Stopped(Exception):
-    """The caller's time is up: no answer, which is not the same as no solution."""
-
-
-def never() -> bool:
-    """Return False: nothing ends the work early."""
-    return False
 
 
 def solve(

@@ -21,8 +21,8 @@ from lmdsl.formulas import PLAIN
 from lmdsl.kernels import kernel
 from lmdsl.merging import add_cost, settle_cost
 from lmdsl.program import Instruction, Program
+from lmdsl.types import Floats
 
-Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 LINE = 512

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from lmdsl.types import Floats
 
-Floats = NDArray[np.float64]
 TIGHT = 1e-9
 
 

@@ -26,11 +26,8 @@ from lmdsl.intervals import Interval
 from lmdsl.jets import Jet
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.program import Check
 from lmdsl.sampling import Nodes, control_range, noise_nodes
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from lmdsl.types import Check, Floats, Indices
 
 MAX_RICCATI = 256  # states of the Riccati equation: orbit points times axes
 PART = 2**12  # states compared with all points of an orbit at a time

@@ -20,11 +20,9 @@ from lmdsl.jets import Jet, apply, enclosure
 from lmdsl.local import LocalController
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.program import FUNCTION, Check
+from lmdsl.program import FUNCTION
 from lmdsl.sampling import noise_nodes
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from lmdsl.types import Check, Floats, Indices
 
 SAMPLES, FEWEST = 10_000, 10
 SAMPLED_WORK = 1e10  # additions that take as long as all samples: some seconds

@@ -30,9 +30,8 @@ from lmdsl.regions import Regions
 from lmdsl.rows import Rows
 from lmdsl.sampling import control_vectors
 from lmdsl.surroundings import own_arithmetic
-from lmdsl.transitions import Progress, assemble, require_least, unless_short
-
-Floats = NDArray[np.float64]
+from lmdsl.transitions import assemble, require_least, unless_short
+from lmdsl.types import Floats, Progress
 
 
 @dataclass(frozen=True, eq=False)

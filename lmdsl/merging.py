@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.kernels import kernel
-from lmdsl.sweeps import ONE
+from lmdsl.kernels import ONE, kernel
 
 Array = NDArray[Any]
 

@@ -21,12 +21,9 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.forking import cached_property
 from lmdsl.frozen import Frozen
 from lmdsl.problem import Problem
+from lmdsl.types import Bools, Floats, Indices
 
 MAX_CELLS = 2**31 - 2
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from lmdsl import threads
 from lmdsl.forking import cached_property
-from lmdsl.kernels import kernel
-from lmdsl.sweeps import CEILING, NEVER, ONE, System
+from lmdsl.kernels import ONE, kernel
+from lmdsl.sweeps import CEILING, NEVER, System
+from lmdsl.types import Floats
 
-Floats = NDArray[np.float64]
 Cells = NDArray[np.uint32]
 
 MANY, PARTS = 40_000, 8

@@ -34,8 +34,8 @@ from lmdsl.frozen import Frozen
 from lmdsl.graph import CellStatus, owner
 from lmdsl.partition import Partition
 from lmdsl.transitions import Transitions
+from lmdsl.types import Floats
 
-Floats = NDArray[np.float64]
 SMALL = 1e-6
 MOST_CELLS = 100
 BYTES = 150

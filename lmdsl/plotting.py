@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lmdsl import inputs, memory
 from lmdsl.drawing import layers, runs
-from lmdsl.drawing.view import At, Floats, View, number, plain
+from lmdsl.drawing.view import At, View, number, plain
 from lmdsl.errors import BadInput, shown
 from lmdsl.files import write_whole
 from lmdsl.graph import CellStatus
@@ -31,6 +31,7 @@ from lmdsl.problem import Problem
 from lmdsl.regions import Regions
 from lmdsl.sampling import control_values
 from lmdsl.surroundings import own_arithmetic
+from lmdsl.types import Floats
 
 if TYPE_CHECKING:
     import os

@@ -14,20 +14,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl import bellman, bounds, graph, leaps, linear, memory
-from lmdsl.kernels import kernel
-from lmdsl.linear import Stop as Stop
-from lmdsl.linear import Stopped, never
+from lmdsl.deadline import Stopped
 from lmdsl.lp import StabilizationLP
 from lmdsl.peeling import Peeled
+from lmdsl.reachability import reaches_attractor
 from lmdsl.screening import Pass, Screen
-from lmdsl.sweeps import CEILING, ONE, TOLERANCE
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from lmdsl.slots import of_policy
+from lmdsl.sweeps import CEILING, TOLERANCE
+from lmdsl.types import Bools, Floats, Pairs, never
+from lmdsl.types import Stop as Stop
 
 TIE = 1e-12
 """Relative difference in Q up to which two controls count as tied."""
@@ -85,36 +82,7 @@ def evaluate(
 
 def peeled(lp: StabilizationLP, pair: Pairs, gamma: float) -> Peeled:
     """Return gamma P_u, ready for :func:`evaluate`."""
-    return Peeled.of(lp.rows.system(pair, gamma, lp.directions))
-
-
-def reaches_attractor(lp: StabilizationLP, pair: Pairs) -> Bools:
-    """Return the cells from which the policy can reach A, shape (n,)."""
-    reaches = np.zeros(lp.n + 1, dtype=np.bool_)
-    reaches[-1] = True
-    if not _reach(pair.view(np.uint64), *lp.rows.kernel[:2], reaches, 64):
-        level, _ = graph.tree(np.arange(lp.n + 1, dtype=np.int64), lp.rows.take(pair))
-        return level >= 0
-    return reaches[:-1]
-
-
-@kernel
-def _reach(pair, pointer, target, reaches, sweeps):  # type: ignore[no-untyped-def]
-    """Mark cells with a marked successor until nothing changes; False where sweeps run out."""
-    n = np.uint64(len(pair))
-    for sweep in range(sweeps):
-        changed = False
-        for t in range(n):
-            i = t if sweep % 2 == 0 else n - ONE - t
-            if reaches[i]:
-                continue
-            for e in range(pointer[pair[i]], pointer[pair[i] + ONE]):
-                if reaches[target[e]]:
-                    reaches[i] = changed = True
-                    break
-        if not changed:
-            return True
-    return False
+    return Peeled.of(of_policy(lp, pair, gamma))
 
 
 @dataclass(frozen=True, eq=False)

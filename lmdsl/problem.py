@@ -37,10 +37,11 @@ from lmdsl.declarations import (
     StateBox,
     SystemUnion,
 )
-from lmdsl.declared import Declared, FormulaText, Positive
+from lmdsl.declared import Declared, Positive
 from lmdsl.errors import BadInput, shown
 from lmdsl.files import read_json, write_whole
 from lmdsl.formulas import Formula, parse
+from lmdsl.names import FormulaText
 from lmdsl.systems import FunctionSystem, System
 
 __all__ = [

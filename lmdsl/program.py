@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from lmdsl.errors import BadInput
 from lmdsl.formulas import OPERATIONS, PLAIN, Formula, Step, fold
 from lmdsl.jets import Jet, apply
-
-Check = Callable[[], object]
-"""Asked during long evaluations whether to go on; it raises if not."""
+from lmdsl.types import Check
 
 
 class Instruction(NamedTuple):

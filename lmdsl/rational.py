@@ -13,11 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.lp import StabilizationLP
-from lmdsl.program import Check
+from lmdsl.types import Check, Floats, Pairs
 
 Row = list[tuple[int, int]]
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
 
 BLOCK = 2**14
 

@@ -15,7 +15,8 @@ from lmdsl.deadline import Deadline
 from lmdsl.errors import BadInput
 from lmdsl.partition import Partition
 from lmdsl.problem import Problem
-from lmdsl.program import Check, Program
+from lmdsl.program import Program
+from lmdsl.types import Check
 
 CELL = 32
 """Bytes of a cell while the sets are made."""

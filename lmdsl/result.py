@@ -19,6 +19,7 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.forking import cached_property
 from lmdsl.frozen import Frozen, freeze
 from lmdsl.graph import CellStatus
+from lmdsl.json_values import jsonable
 from lmdsl.local import LocalController
 from lmdsl.local_check import LocalCheck
 from lmdsl.partition import Partition
@@ -26,6 +27,7 @@ from lmdsl.problem import Problem
 from lmdsl.regions import Regions
 from lmdsl.surroundings import own_arithmetic
 from lmdsl.systems.base import NotStored
+from lmdsl.types import Floats
 
 if TYPE_CHECKING:
     import os
@@ -34,7 +36,6 @@ if TYPE_CHECKING:
 
 EXIT = {"verified": 0, "unverified": 1, "bad_input": 2, "not_stabilizable": 3, "solver_failed": 4}
 ARRAYS = ("control_index", "value", "lower", "measure", "cell_status")
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -164,24 +165,6 @@ class Report(Frozen):
     def exit_status(self) -> int:
         """Exit status of the command line."""
         return EXIT[self.status]
-
-
-def jsonable(value: Any) -> Any:
-    """Return plain data that strict JSON can hold."""
-    if isinstance(value, Seconds | LocalCheck):
-        return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
-    if isinstance(value, tuple | list):
-        return [jsonable(v) for v in value]
-    if isinstance(value, dict):
-        return {k: jsonable(v) for k, v in value.items()}
-    if isinstance(value, float | np.floating):
-        number = float(value)
-        if math.isnan(number):
-            return None
-        return number if math.isfinite(number) else "inf" if number > 0 else "-inf"
-    if isinstance(value, np.integer):
-        return int(value)
-    return value
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,8 @@ equation, a sum of matrices >= 0.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lmdsl.types import Floats
 
 STEPS, DOUBLINGS = 200, 64
 ENOUGH, ROUNDING, FALLING = 1e-13, 1e-6, 0.9

@@ -24,6 +24,7 @@ from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.program import Program
 from lmdsl.systems.function import Audit, FunctionStep
+from lmdsl.types import Floats
 
 CHUNK = 2**17
 """Samples evaluated at a time: few enough to stay in cache, many enough to keep threads apart."""
@@ -33,8 +34,6 @@ LEAST_LINE = 64
 
 FEW = 16
 """Cells and controls of which a function is asked twice."""
-
-Floats = NDArray[np.float64]
 
 
 class Block(NamedTuple):

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from lmdsl import memory
 from lmdsl.problem import ControlRange, ControlValues, Grid, NoiseNormal, Problem, Random
-
-Floats = NDArray[np.float64]
+from lmdsl.types import Floats
 
 NODE = 400
 """Bytes for each noise node: its values, its weight, and what orders them."""

@@ -17,15 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import bellman
+from lmdsl import bellman, vectors
 from lmdsl.forking import cached_property
-from lmdsl.kernels import kernel
+from lmdsl.kernels import ONE, kernel
 from lmdsl.lp import StabilizationLP
-from lmdsl.rows import Slots, copy_row
-from lmdsl.sweeps import ONE
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
+from lmdsl.slots import Slots, copy_row
+from lmdsl.types import Floats, Pairs
 
 LEAST_SCALE = 1e-30
 MOST = 1e308
@@ -104,7 +101,7 @@ class Screen:
         """
         lp = self.lp
         value, new = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
-        x, backwards = bellman.padded(V), self.passes % 2 == 1
+        x, backwards = vectors.padded(V), self.passes % 2 == 1
         self.passes += 1
         own, slots = pair.view(np.uint64), self.slots.kernel
 
@@ -115,7 +112,7 @@ class Screen:
             )  # fmt: skip
             return int(changed), int(looked)
 
-        counts = bellman.over_cells(lp, part, bellman.IN_PLACE)
+        counts = vectors.over_cells(lp, part, bellman.IN_PLACE)
         self.pair = new
         return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
 
@@ -138,7 +135,7 @@ class Screen:
         several : whether a cell has more than one
         """
         lp = self.lp
-        x, ties = bellman.padded(V), np.empty(lp.K, dtype=np.bool_)
+        x, ties = vectors.padded(V), np.empty(lp.K, dtype=np.bool_)
         first, own = np.empty(lp.n, dtype=np.int64), pair.view(np.uint64)
         known = self.pair is not None and np.array_equal(self.pair, pair)
         rival = self.rival if known else np.zeros(lp.n)
@@ -152,7 +149,7 @@ class Screen:
             )  # fmt: skip
             return bool(several)
 
-        return ties, first, any(bellman.over_cells(lp, part))
+        return ties, first, any(vectors.over_cells(lp, part))
 
     def follow(self, before: Floats, after: Floats) -> None:
         """Note that V fell from ``before`` to ``after``."""

@@ -14,10 +14,9 @@ from lmdsl import backends, bellman, certificate, feasibility, gamma, inputs, po
 from lmdsl.asking import ask
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.certificate import Certificate, Verified, Witness
-from lmdsl.deadline import Deadline, TimeLimitReached
+from lmdsl.deadline import Deadline, Stopped, TimeLimitReached
 from lmdsl.errors import BadInput, shown
 from lmdsl.graph import CellStatus
-from lmdsl.linear import Stopped
 from lmdsl.local import LocalController
 from lmdsl.local_check import check
 from lmdsl.lp import StabilizationLP, compile
@@ -26,14 +25,12 @@ from lmdsl.problem import Problem
 from lmdsl.result import Coverage, Result, Seconds
 from lmdsl.sampling import control_count, control_vectors
 from lmdsl.surroundings import own_arithmetic
-from lmdsl.transitions import Progress
+from lmdsl.types import Pairs, Progress
 from lmdsl.witness import certify
 
 TOLERANCE = 1e-6
 UNKNOWN = 255
 """Status of cells of which nothing is known."""
-
-Pairs = NDArray[np.int64]
 
 
 @own_arithmetic
@@ -221,7 +218,7 @@ def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[str, str]
 
 
 def _refuse(lp: StabilizationLP, found: feasibility.Refused, tolerance: float) -> Verified:
-    from lmdsl.bounds import lower_until_below
+    from lmdsl.descent import lower_until_below
 
     w = lower_until_below(lp, found.w, lp.gamma, None)
     witness = Witness(None, found.w if w is None else w)

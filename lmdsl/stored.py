@@ -13,11 +13,12 @@ from lmdsl.archive import SCOPE, identity
 from lmdsl.certificate import CLAIMS, MEASURE_TOLERANCE, Certificate
 from lmdsl.deadline import Deadline
 from lmdsl.graph import CellStatus
+from lmdsl.json_values import jsonable
 from lmdsl.local import LocalController
 from lmdsl.local_check import SAMPLES, LocalCheck
 from lmdsl.local_check import check as check_local
 from lmdsl.lp import StabilizationLP
-from lmdsl.result import Result, jsonable
+from lmdsl.result import Result
 from lmdsl.sampler import Sampler
 from lmdsl.systems import FunctionSystem
 

@@ -11,9 +11,8 @@ import sys
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from lmdsl.types import Floats
 
 UNIT = 1.1 * 2.0**-53
 LEAST = 2.0**-1074

@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 
 from lmdsl import threads
 from lmdsl.directions import Directions
-from lmdsl.kernels import kernel
-
-Floats = NDArray[np.float64]
+from lmdsl.kernels import ONE, kernel
+from lmdsl.types import Floats
 
 TOLERANCE = 2e-15
 CEILING = 1e305
 NEVER = 1e308
 SPLIT = 100_000
-ONE = np.uint64(1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,6 @@ threads and appended in order, so the rows do not depend on the number of thread
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -29,9 +28,7 @@ from lmdsl.program import Program
 from lmdsl.regions import Regions
 from lmdsl.rows import Rows, Shares, code_type
 from lmdsl.sampler import CHUNK, Block, Sampler
-
-Floats = NDArray[np.float64]
-Progress = Callable[[str, float], None]
+from lmdsl.types import Floats, Progress
 
 
 @dataclass(frozen=True, eq=False)

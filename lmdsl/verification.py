@@ -21,15 +21,17 @@ from lmdsl.errors import BadInput
 from lmdsl.exact import check_exactly
 from lmdsl.gamma import restricted
 from lmdsl.graph import CellStatus
+from lmdsl.json_values import jsonable
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.regions import Regions
-from lmdsl.result import Result, jsonable
+from lmdsl.result import Result
 from lmdsl.rows import Rows, Shares
 from lmdsl.sampling import noise_nodes, sample_points
 from lmdsl.stored import differences, function_differences, local_differences
 from lmdsl.surroundings import own_arithmetic
 from lmdsl.systems import FunctionSystem
-from lmdsl.transitions import Progress, estimate
+from lmdsl.transitions import estimate
+from lmdsl.types import Progress
 
 Judge = Callable[[StabilizationLP, Witness, float], Certificate]
 LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)

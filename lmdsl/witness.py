@@ -9,9 +9,8 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl import bounds, linear, policy, threads
+from lmdsl import bounds, descent, linear, policy, threads
 from lmdsl.certificate import (
     MANY,
     MEASURE_TOLERANCE,
@@ -24,13 +23,10 @@ from lmdsl.certificate import (
     gap,
     weighted,
 )
-from lmdsl.linear import Stop, Stopped, never
+from lmdsl.deadline import Stopped
 from lmdsl.lp import StabilizationLP
 from lmdsl.peeling import Peeled
-
-Floats = NDArray[np.float64]
-Pairs = NDArray[np.int64]
-
+from lmdsl.types import Floats, Pairs, Stop, never
 
 MOST_GUESSED = 1e-7
 
@@ -181,12 +177,12 @@ def lower_vector(
         if W is not None:
             return W
         start = V * (1 - min(tolerance, 1e-6) / 4)
-        W = bounds.lower_until_below(lp, start, lp.gamma, lp.cost, stop=stop)
+        W = descent.lower_until_below(lp, start, lp.gamma, lp.cost, stop=stop)
         if W is not None:
             candidates.append(W)
     if V is None or not candidates or gap(lp, V, candidates[0]) > tolerance:
         passes = max(LEAST_PASSES, min(MOST_PASSES, MOST_READ // max(len(lp.rows.target), 1)))
-        candidates.append(bounds.raise_from_zero(lp, lp.gamma, lp.cost, passes, stop))
+        candidates.append(descent.raise_from_zero(lp, lp.gamma, lp.cost, passes, stop))
     good = [W for W in candidates if check_lower(lp, W)]
     best: Floats = max(good, key=lambda W: weighted(lp, W), default=zero)
     return best

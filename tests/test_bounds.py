@@ -10,7 +10,7 @@ from models import dense, mdp, random_lp
 from problems import made, steps
 
 import lmdsl as lm
-from lmdsl import bounds, certificate, sums
+from lmdsl import bounds, certificate, descent, sums
 from lmdsl.bounds import exact_backup
 
 
@@ -25,7 +25,7 @@ def test_bounds_enclose_the_exact_value(scale, gamma):
         pair = lp.pair_pointer[:-1].copy()
         x = rng.random(lp.n) * 10.0 ** rng.integers(-9, 9, lp.n) * scale
         above = bounds.expected_above(lp, pair, x, gamma)
-        below = bounds.backup_below(lp, x, gamma, lp.cost)
+        below = descent.backup_below(lp, x, gamma, lp.cost)
         for i, k in enumerate(pair):
             exact = exact_backup(lp, int(k), x, gamma, None)
             if np.isfinite(above[i]):
@@ -69,7 +69,7 @@ def test_bounds_hold_where_every_rounding_errs_the_same_way(direction):
     exact = exact_backup(lp, 0, V, 1.0, None)
     assert direction * (Fraction(q) - exact) > 100 * Fraction(2) ** -53 * exact
     assert Fraction(bounds.expected_above(lp, lp.pair_pointer[:-1], V, 1.0)[0]) >= exact
-    assert Fraction(bounds.backup_below(lp, V, 1.0, None)[0]) <= exact
+    assert Fraction(descent.backup_below(lp, V, 1.0, None)[0]) <= exact
 
 
 @pytest.mark.parametrize("direction", [1, -1])

@@ -9,9 +9,10 @@ from models import random_lp
 from problems import made
 
 import lmdsl as lm
-from lmdsl import feasibility, leaps, linear, policy, sweeps
+from lmdsl import feasibility, leaps, linear, policy, sweeps, types
 from lmdsl.peeling import Peeled
 from lmdsl.screening import Screen
+from lmdsl.slots import of_policy
 
 
 def mixing(n, escape, rng, spread=4):
@@ -58,7 +59,7 @@ def test_the_rows_of_a_policy_as_a_system(gamma):
     stays = np.zeros(lp.n, dtype=bool)
     for _ in range(20):
         pair = rng.integers(lp.pair_pointer[:-1], lp.pair_pointer[1:])
-        found = lp.rows.system(pair, gamma, lp.directions)
+        found = of_policy(lp, pair, gamma)
         expected = gamma * lp.rows.matrix(pair).toarray()
         own = expected.diagonal().copy()
         stays |= own == gamma
@@ -151,7 +152,7 @@ def test_a_policy_is_proved_stabilizing_where_mass_hardly_escapes(monkeypatch):
     pair, ones, lifted = lp.tree[1], np.ones(lp.n), []
     lift = linear.lift
     monkeypatch.setattr(linear, "lift", lambda *a: lifted.append(lift(*a)) or lifted[-1])
-    assert feasibility._proved(lp, pair, ones, linear.never) is not None
+    assert feasibility._proved(lp, pair, ones, types.never) is not None
     assert lifted == [True]
     assert policy.peeled(lp, pair, 1.0).system.sweep(ones, ones.copy(), 200)[1] > 1e-3
 
@@ -185,7 +186,7 @@ def test_a_policy_is_proved_stabilizing_as_long_as_sweeps_gain(monkeypatch):
     start, unit = np.full(lp.n, horizon), np.ones(lp.K)
     done = policy.iterate(lp, lp.tree[1], start, 1 - 1 / horizon, unit, limit=6)
     calls.clear()
-    assert feasibility._proved(lp, done.pair, done.value, linear.never) is not None
+    assert feasibility._proved(lp, done.pair, done.value, types.never) is not None
     assert len(calls) > 1
 
 
@@ -225,12 +226,12 @@ def test_krylov_refuses_cells_that_stay_put_for_ever(own, size):
     M = sp.lil_array(mixing(1500, 0.1, rng))
     M[7, 7] = own
     M, b = sp.csr_array(M), np.full(1500, size)
-    assert linear._krylov(sweeps.System.of(M), b, b.copy(), linear.never) is None
+    assert linear._krylov(sweeps.System.of(M), b, b.copy(), types.never) is None
     assert linear.solve(M, b) is None
 
 
 def test_krylov_finds_the_slow_mode_of_a_well_mixed_set():
     rng = np.random.default_rng(5)
     M, b = mixing(3000, 1e-6, rng), np.ones(3000)
-    guess = linear._krylov(sweeps.System.of(M), b, b.copy(), linear.never)
+    guess = linear._krylov(sweeps.System.of(M), b, b.copy(), types.never)
     np.testing.assert_allclose(guess, exact(M, b), rtol=1e-6)

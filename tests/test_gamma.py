@@ -15,7 +15,7 @@ from problems import doubling, made, standard_map, steps
 from scipy.sparse.linalg import eigs
 
 import lmdsl as lm
-from lmdsl import feasibility, gamma, growth, linear
+from lmdsl import feasibility, gamma, growth, linear, types
 from lmdsl.bounds import exactly_below
 from lmdsl.cli import main
 from lmdsl.directions import Directions
@@ -187,11 +187,11 @@ def test_the_rate_of_a_large_class_needs_no_factors(shift, monkeypatch):
     M = sp.csr_array((weight, (np.tile(np.arange(n), 4), target)), (n, n))
     M = sp.csr_array(M / (1.1 * M.sum(axis=1).max()))
     monkeypatch.setattr(linear, "solve_by_class", None)
-    x, rate, least = growth._perron(M, linear.never, 0.0, Directions.line(n))
+    x, rate, least = growth._perron(M, types.never, 0.0, Directions.line(n))
     assert (x > 0).all()
     assert least <= rate <= least * (1 + 1e-9)
     assert rate == pytest.approx(abs(eigs(M, k=1, return_eigenvectors=False)[0]), rel=1e-9)
-    early = growth._perron(M, linear.never, 2 * rate, Directions.line(n))
+    early = growth._perron(M, types.never, 2 * rate, Directions.line(n))
     assert rate < early[1] < 2 * rate
 
 

@@ -19,7 +19,7 @@ from models import mdp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import feasibility, gamma, linear, policy, saving
+from lmdsl import deadline, feasibility, gamma, linear, policy, saving
 
 HERE = Path(__file__).parent
 posix = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and signals")
@@ -315,7 +315,7 @@ def test_a_time_limit_holds_within_the_sweeps_of_one_evaluation(monkeypatch):
     def late():
         return next(asked) >= 100
 
-    with pytest.raises(linear.Stopped):
+    with pytest.raises(deadline.Stopped):
         policy.evaluate(lp, pair, stop=late)
     assert next(asked) < 105
     assert isinstance(feasibility.stabilizing(lp, late), feasibility.Undecided)

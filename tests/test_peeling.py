@@ -18,7 +18,7 @@ from scipy.sparse.linalg import splu, spsolve
 
 from lmdsl import linear, peeling, rows, threads
 from lmdsl.peeling import Peeled
-from lmdsl.rows import Slots
+from lmdsl.slots import Slots
 from lmdsl.sweeps import System
 
 

@@ -12,14 +12,14 @@ from models import mdp, random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import bellman, certificate, linear, peeling, rows, sweeps, threads, witness
+from lmdsl import bellman, certificate, linear, peeling, rows, sweeps, threads, vectors, witness
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_ranges_and_halves_give_the_same_policy(monkeypatch, workers):
     problem = made(standard_map(16))
     whole = lm.solve(problem)
-    monkeypatch.setattr(bellman, "GRAIN", 1)
+    monkeypatch.setattr(vectors, "GRAIN", 1)
     monkeypatch.setattr(sweeps, "SPLIT", 1)
     for room in (rows, peeling, certificate, witness):
         monkeypatch.setattr(room, "MANY", 1)
@@ -45,7 +45,7 @@ def test_a_pass_agrees_with_numpy(monkeypatch):
     lp = lm.compile(made(standard_map(16)))
     V = np.random.default_rng(1).random(lp.n)
     Q = lp.gamma * (lp.rows.matrix() @ V) + lp.cost
-    monkeypatch.setattr(bellman, "GRAIN", 1)
+    monkeypatch.setattr(vectors, "GRAIN", 1)
     found = bellman.improve(lp, V)
     np.testing.assert_allclose(found.value, np.minimum.reduceat(Q, lp.pair_pointer[:-1]))
     np.testing.assert_allclose(Q[found.pair], found.value)
@@ -54,7 +54,7 @@ def test_a_pass_agrees_with_numpy(monkeypatch):
 @pytest.mark.parametrize("gamma", [0.9, 1.0, 1.3])
 def test_a_rising_pass_agrees_with_numpy(gamma, monkeypatch):
     """Cells in turn, staying put summed up; who stays at no less than 1 / gamma is no choice."""
-    monkeypatch.setattr(bellman, "GRAIN", 1)
+    monkeypatch.setattr(vectors, "GRAIN", 1)
     rose = stuck = 0
     for seed in range(20):
         rng = np.random.default_rng(seed)

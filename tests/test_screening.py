@@ -10,7 +10,7 @@ from models import random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import bellman, feasibility, policy
+from lmdsl import bellman, feasibility, policy, vectors
 from lmdsl.screening import Screen
 
 MARGIN = 1e-12
@@ -69,7 +69,7 @@ def begun(lp):
 @pytest.mark.parametrize("ranges", [1, 3])
 def test_passes_agree_with_numpy_and_bounds_hold(monkeypatch, ranges):
     monkeypatch.setattr(bellman, "IN_PLACE", ranges)
-    monkeypatch.setattr(bellman, "GRAIN", 1)
+    monkeypatch.setattr(vectors, "GRAIN", 1)
     left_out = 0
     for lp in models():
         if (start := begun(lp)) is None:

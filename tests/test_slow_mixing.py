@@ -7,7 +7,7 @@ from problems import made, standard_map
 from test_evaluation import above, exact, mixing, transport
 
 import lmdsl as lm
-from lmdsl import feasibility, linear, policy, sweeps
+from lmdsl import feasibility, linear, policy, sweeps, types
 from lmdsl.peeling import Peeled
 
 
@@ -89,5 +89,5 @@ def test_the_optimum_is_the_same_however_policies_are_evaluated(patience, monkey
 
 def test_a_policy_that_only_loses_by_chance_is_proved_stabilizing():
     lp = lm.compile(made(killed(1e-5)))
-    found = feasibility._proved(lp, lp.tree[1], np.ones(lp.n), linear.never)
+    found = feasibility._proved(lp, lp.tree[1], np.ones(lp.n), types.never)
     assert found is not None

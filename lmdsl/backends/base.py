@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.frozen import Frozen
+from lmdsl.types import Floats
 
 if TYPE_CHECKING:
     from lmdsl.lp import StabilizationLP
-
-Floats = NDArray[np.float64]
 
 
 class Stop(Enum):

@@ -11,7 +11,7 @@ import time
 
 from lmdsl import feasibility, policy
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
-from lmdsl.linear import Stopped
+from lmdsl.deadline import Stopped
 from lmdsl.lp import StabilizationLP
 
 

@@ -15,17 +15,15 @@ from traceback import walk_tb
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl import apart, memory
 from lmdsl.backends.base import Options, Solution, Stop
 from lmdsl.deadline import Deadline, TimeLimitReached
 from lmdsl.errors import plain_text
+from lmdsl.types import Floats
 
 if TYPE_CHECKING:
     from lmdsl.lp import StabilizationLP
-
-Floats = NDArray[np.float64]
 
 
 ENTRY = 100

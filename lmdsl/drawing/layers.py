@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.drawing.view import Bools, Floats, View, number, rectangles, segments
+from lmdsl.drawing.view import View, number, rectangles, segments
 from lmdsl.errors import BadInput, MissingDependency, shown
 from lmdsl.graph import CellStatus
+from lmdsl.types import Bools, Floats
 
 DECADES, DEEPEST = 2, 8
 """Colours are logarithmic from so many decades on, and span no more than so many."""

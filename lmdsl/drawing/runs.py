@@ -16,6 +16,7 @@ from lmdsl.partition import Partition
 from lmdsl.problem import Problem
 from lmdsl.sampling import control_values, noise_nodes
 from lmdsl.systems.base import NamedOde, OdeSystem
+from lmdsl.types import Floats
 
 if TYPE_CHECKING:
     from lmdsl.result import Result
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 PIECES = 8
 """Drawn lines of a differential equation have so many pieces a step."""
 
-Floats = NDArray[np.float64]
 Map = Callable[[Floats, Floats], Floats]
 
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from lmdsl import inputs
 from lmdsl.errors import BadInput, shown
 from lmdsl.partition import Partition
+from lmdsl.types import Bools, Floats
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 At = Mapping[str, float]
 
 

@@ -17,13 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
-from lmdsl.declared import Declared, Formulas, Parameters, Positive, plain
+from lmdsl.declared import Declared, Positive, plain
 from lmdsl.errors import BadInput, shown
 from lmdsl.forking import cached_property
 from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, Formula, parse
 from lmdsl.jets import Jet
-from lmdsl.program import Check, Program
+from lmdsl.names import Formulas, Parameters
+from lmdsl.program import Program
 from lmdsl.recording import Recorder
+from lmdsl.types import Check
 
 Array = NDArray[np.float64]
 Step = Callable[..., tuple[Array, ...]]

@@ -13,9 +13,9 @@ import numpy as np
 from pydantic import Field
 
 from lmdsl.errors import BadInput, shown
-from lmdsl.program import Check
 from lmdsl.surroundings import restore_rounding
 from lmdsl.systems.base import Array, Step, System
+from lmdsl.types import Check
 
 WHERE = "system.next"
 ALONE, OF_BLOCK = 8, 2

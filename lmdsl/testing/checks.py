@@ -28,6 +28,7 @@ from lmdsl.testing.probe import (
     misshapen,
     owned,
 )
+from lmdsl.types import Floats
 
 BY_HAND = (
     *(known.single(gamma) for gamma in (0.9, 1.0, 1.5)),
@@ -117,7 +118,7 @@ def dual_sign(probe: Probe) -> None:
     """V is the derivative of the optimal cost in m, sign included, by finite differences."""
     weight, h = np.array([0.5, 0.3, 0.2]), 0.1
 
-    def at(m: known.Floats) -> tuple[float, Solution]:
+    def at(m: Floats) -> tuple[float, Solution]:
         found = probe.ask(known.weighted(SMALL.compile(), m))
         lp = known.weighted(SMALL.own, m)
         if not found.stop.success:

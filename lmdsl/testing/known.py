@@ -12,13 +12,11 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.forking import cached_property
 from lmdsl.lp import StabilizationLP, compile
 from lmdsl.problem import Problem
-
-Floats = NDArray[np.float64]
+from lmdsl.types import Floats
 
 
 @dataclass(frozen=True, eq=False)

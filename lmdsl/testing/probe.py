@@ -15,8 +15,7 @@ from lmdsl.backends.scaled import failure
 from lmdsl.errors import LmdslError, MissingDependency
 from lmdsl.lp import StabilizationLP
 from lmdsl.testing.known import Known
-
-Floats = NDArray[np.float64]
+from lmdsl.types import Floats
 
 ACCURACY = 1e-5
 """Largest relative error of an answer that was asked for without a tolerance."""

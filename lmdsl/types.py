@@ -1,0 +1,29 @@
+"""Names of types that every room uses: arrays by what they hold, and callables of the caller's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+"""Whole numbers, such as cells, positions or columns."""
+Pairs = NDArray[np.int64]
+"""A policy: a column per position of C, shape (n,); or any columns."""
+
+Stop = Callable[[], bool]
+"""Asked now and then by what takes long: True ends the work early."""
+Progress = Callable[[str, float], None]
+"""Told what is being done, and which part of it, 0 to 1, is done."""
+
+
+def never() -> bool:
+    """Return False: nothing ends the work early."""
+    return False
+
+
+Check = Callable[[], object]
+"""Asked during long evaluations whether to go on; it raises if not."""
