@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import lmdsl as lm
-from lmdsl import bellman, memory, policy, witness
-from lmdsl.partition import Partition
-from lmdsl.rows import Rows, Shares
-from lmdsl.sampling import Nodes
+from lmdsl.machine import memory
+from lmdsl.model.discretization import Nodes
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.rows import Rows, Shares
+from lmdsl.optimize import witness
+from lmdsl.optimize.policies import bellman, policy
 
 
 def transitions(lp: lm.StabilizationLP) -> tuple[Any, Any, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from lmdsl import forking as forking
+from lmdsl.machine import forking as forking
 
 if TYPE_CHECKING:
     from lmdsl import backends as backends
@@ -16,63 +16,69 @@ if TYPE_CHECKING:
     from lmdsl import plotting as plotting
     from lmdsl import systems as systems
     from lmdsl import testing as testing
-    from lmdsl.certificate import Certificate as Certificate
-    from lmdsl.comparison import Comparison as Comparison
-    from lmdsl.comparison import compare as compare
-    from lmdsl.controller import Controller as Controller
-    from lmdsl.controller import Simulation as Simulation
-    from lmdsl.deadline import TimeLimitReached as TimeLimitReached
+    from lmdsl.certificate.claims import Certificate as Certificate
+    from lmdsl.control.controller import Controller as Controller
+    from lmdsl.control.controller import Simulation as Simulation
     from lmdsl.errors import BadInput as BadInput
     from lmdsl.errors import LmdslError as LmdslError
-    from lmdsl.explanation import explain as explain
-    from lmdsl.gamma import GammaBar as GammaBar
-    from lmdsl.gamma import gamma_max as gamma_max
-    from lmdsl.graph import CellStatus as CellStatus
-    from lmdsl.lp import StabilizationLP as StabilizationLP
-    from lmdsl.lp import compile as compile
-    from lmdsl.problem import Problem as Problem
-    from lmdsl.problem import load as load
-    from lmdsl.result import Result as Result
-    from lmdsl.stabilize import solve as solve
-    from lmdsl.verification import Verification as Verification
-    from lmdsl.verification import verify as verify
+    from lmdsl.explanation.causes import explain as explain
+    from lmdsl.machine.deadline import TimeLimitReached as TimeLimitReached
+    from lmdsl.model.lp import StabilizationLP as StabilizationLP
+    from lmdsl.model.lp import compile as compile
+    from lmdsl.model.stabilizable_set import CellStatus as CellStatus
+    from lmdsl.optimize.feasibility.gamma import GammaBar as GammaBar
+    from lmdsl.optimize.feasibility.gamma import gamma_max as gamma_max
+    from lmdsl.problem.problem import Problem as Problem
+    from lmdsl.problem.problem import load as load
+    from lmdsl.results.comparison import Comparison as Comparison
+    from lmdsl.results.comparison import compare as compare
+    from lmdsl.results.result import Result as Result
+    from lmdsl.results.solving import solve as solve
+    from lmdsl.results.verification import Verification as Verification
+    from lmdsl.results.verification import verify as verify
 
 __version__ = "0.1.0"
 
 _HOME = {
     "BadInput": "errors",
-    "CellStatus": "graph",
-    "Certificate": "certificate",
-    "Comparison": "comparison",
-    "Controller": "controller",
-    "GammaBar": "gamma",
+    "CellStatus": "model.stabilizable_set",
+    "Certificate": "certificate.claims",
+    "Comparison": "results.comparison",
+    "Controller": "control.controller",
+    "GammaBar": "optimize.feasibility.gamma",
     "LmdslError": "errors",
-    "Problem": "problem",
-    "Result": "result",
-    "Simulation": "controller",
-    "StabilizationLP": "lp",
-    "TimeLimitReached": "deadline",
-    "Verification": "verification",
-    "compare": "comparison",
-    "compile": "lp",
-    "explain": "explanation",
-    "gamma_max": "gamma",
-    "load": "problem",
-    "solve": "stabilize",
-    "verify": "verification",
+    "Problem": "problem.problem",
+    "Result": "results.result",
+    "Simulation": "control.controller",
+    "StabilizationLP": "model.lp",
+    "TimeLimitReached": "machine.deadline",
+    "Verification": "results.verification",
+    "compare": "results.comparison",
+    "compile": "model.lp",
+    "explain": "explanation.causes",
+    "gamma_max": "optimize.feasibility.gamma",
+    "load": "problem.problem",
+    "solve": "results.solving",
+    "verify": "results.verification",
 }
-_MODULES = ("backends", "exports", "plotting", "systems", "testing")
+_PACKAGES = {
+    "backends": "backends",
+    "exports": "results.exports",
+    "plotting": "plotting",
+    "systems": "systems",
+    "testing": "testing",
+}
 
-__all__ = ["__version__", *_HOME, *_MODULES]
+__all__ = ["__version__", *_HOME, *_PACKAGES]
 
 
 def __getattr__(name: str) -> Any:
     if name in _HOME:
         with forking.whole:
             value = getattr(import_module(f"lmdsl.{_HOME[name]}"), name)
-    elif name in _MODULES:
+    elif name in _PACKAGES:
         with forking.whole:
-            value = import_module(f"lmdsl.{name}")
+            value = import_module(f"lmdsl.{_PACKAGES[name]}")
     else:
         raise AttributeError(f"module 'lmdsl' has no attribute {name!r}")
     globals()[name] = value

@@ -21,8 +21,8 @@ from pathlib import Path
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import archive, saving
-from lmdsl.result import ARRAYS
+from lmdsl.results.directory import archive, writing
+from lmdsl.results.result import ARRAYS
 
 GAMMAS = (1.0, 1.01, 1.02)  # save k has GAMMAS[k % 3]: the saves before and after it differ
 
@@ -53,7 +53,7 @@ def at_line(number: int, act) -> None:
     left = itertools.count(number - 1, -1)
 
     def trace(frame, event, _):
-        if frame.f_code.co_filename not in (archive.__file__, saving.__file__):
+        if frame.f_code.co_filename not in (archive.__file__, writing.__file__):
             return None
         if event == "line" and next(left) == 0:
             act()

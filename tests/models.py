@@ -8,10 +8,10 @@ import numpy as np
 from problems import made, steps
 
 import lmdsl as lm
-from lmdsl import graph
-from lmdsl.partition import Partition
-from lmdsl.rows import Rows, Shares, code_type
-from lmdsl.sampling import Nodes
+from lmdsl.model import stabilizable_set
+from lmdsl.model.discretization import Nodes
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.rows import Rows, Shares, code_type
 
 
 def random_lp(
@@ -62,7 +62,7 @@ def random_lp(
     cost = rng.random(len(rows)) * 10.0 ** rng.integers(-2, 3)
     cost[rng.random(len(rows)) < zero] = 0.0
     lp = build(pair_pointer, control, compact, cost, gamma)
-    found = graph.stabilizable(pair_pointer, compact)
+    found = stabilizable_set.stabilizable(pair_pointer, compact)
     if found.inside.all() and found.surviving.all():
         return lp
     return _only(lp, found)

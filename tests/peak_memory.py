@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import lmdsl as lm
-from lmdsl import memory
+from lmdsl.machine import memory
 
 require, fits = memory.require, memory.fits
 data, small, command = json.load(sys.stdin)

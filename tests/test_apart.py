@@ -13,10 +13,10 @@ import pytest
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import apart
 from lmdsl.backends import Options, Stop
 from lmdsl.backends.scaled import ScaledLP
-from lmdsl.deadline import Deadline, TimeLimitReached
+from lmdsl.machine import apart
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
 
 NEVER, SOON, LONG = Deadline(), 0.01, 1e6
 

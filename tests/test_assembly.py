@@ -10,10 +10,12 @@ import pytest
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import axis, merging, sampler, threads
-from lmdsl.axis import EDGE
-from lmdsl.merging import mean_cost, merge, tile
-from lmdsl.partition import Partition
+from lmdsl.machine import threads
+from lmdsl.model.assembly import merging, sampler
+from lmdsl.model.assembly.merging import mean_cost, merge, tile
+from lmdsl.model.grid import axis
+from lmdsl.model.grid.axis import EDGE
+from lmdsl.model.grid.partition import Partition
 
 
 def cell_of(x, low, high, cells, periodic, clip):

@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 
 from lmdsl import backends
-from lmdsl import lp as model
 from lmdsl.backends import BUILT_IN, Options, Solution, Stop, get, names, resolve
 from lmdsl.backends import clarabel as clarabel_backend
 from lmdsl.backends import cvxpy as cvxpy_backend
@@ -30,8 +29,9 @@ from lmdsl.backends import ipopt as ipopt_backend
 from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.cli import main
 from lmdsl.errors import BadInput, MissingDependency
-from lmdsl.lp import StabilizationLP
-from lmdsl.problem import Problem
+from lmdsl.model import lp as model
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.problem.problem import Problem
 from lmdsl.systems import StandardMap
 from lmdsl.testing import known
 

@@ -15,11 +15,12 @@ import pytest
 from problems import made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl import memory, sampling
-from lmdsl.formulas import parse
-from lmdsl.program import Program
-from lmdsl.regions import Regions
-from lmdsl.transitions import estimate
+from lmdsl.formulas.language import parse
+from lmdsl.formulas.program import Program
+from lmdsl.machine import memory
+from lmdsl.model import discretization
+from lmdsl.model.assembly.transitions import estimate
+from lmdsl.model.sets import Regions
 
 HERE = Path(__file__).parent
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
@@ -58,10 +59,14 @@ def test_what_is_too_large_is_refused_before_anything_is_made(name, call, monkey
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("make", [sampling.offsets, sampling.control_vectors, sampling.noise_nodes])
+@pytest.mark.parametrize(
+    "make", [discretization.offsets, discretization.control_vectors, discretization.noise_nodes]
+)
 def test_grids_ask_by_themselves(make, monkeypatch):
     monkeypatch.setattr(memory, "available", lambda: memory.Room(10**7, "a test"))
-    name = {sampling.offsets: "points", sampling.noise_nodes: "noise"}.get(make, "controls")
+    name = {discretization.offsets: "points", discretization.noise_nodes: "noise"}.get(
+        make, "controls"
+    )
     with pytest.raises(lm.BadInput, match="a test"):
         make(made(HUGE[name]))
 
@@ -120,7 +125,7 @@ def test_noise_nodes_are_the_product_in_order():
         "w": {"normal": {"std": 0.1, "points": 4}},
         "z": {"values": [0.0, 5.0], "weights": [1 - 5e-324, 5e-324]},
     }
-    nodes = sampling.noise_nodes(made(steps(noise=noise)))
+    nodes = discretization.noise_nodes(made(steps(noise=noise)))
     x, w = np.polynomial.hermite.hermgauss(4)
     each = [
         [(1.0, 0.25), (3.0, 0.75)],
@@ -141,9 +146,9 @@ def test_noise_nodes_are_the_product_in_order():
 
 def test_the_range_of_controls_needs_no_values():
     grid = {"u": {"values": [0.5, -2, 1]}, "v": {"low": -1, "high": 3, "points": 7}}
-    low, high = sampling.control_range(made(steps(control_grid=grid)))
+    low, high = discretization.control_range(made(steps(control_grid=grid)))
     assert (low.tolist(), high.tolist()) == ([-2, -1], [1, 3])
-    assert [x.shape for x in sampling.control_range(made(steps(
+    assert [x.shape for x in discretization.control_range(made(steps(
         control_grid={}, system={"kind": "map", "next": {"x": "x"}})))] == [(0,), (0,)]  # fmt: skip
 
 

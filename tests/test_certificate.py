@@ -13,18 +13,20 @@ from models import dense, random_lp
 from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl import feasibility, policy, witness
-from lmdsl.bounds import exactly_below, holds_for_all
-from lmdsl.certificate import CLAIMS, Witness, check
-from lmdsl.exact import check_exactly
-from lmdsl.rows import Rows
+from lmdsl.certificate.bounds import exactly_below, holds_for_all
+from lmdsl.certificate.claims import CLAIMS, Witness, check
+from lmdsl.certificate.exact_checks import check_exactly
+from lmdsl.model.rows import Rows
+from lmdsl.optimize import witness
+from lmdsl.optimize.feasibility import first_policy
+from lmdsl.optimize.policies import policy
 
 
 @pytest.fixture(scope="module")
 def solved():
     """The standard map on 20 x 20 cells, its witness and certificate."""
     lp = lm.compile(made(standard_map(20)))
-    found = feasibility.stabilizing(lp)
+    found = first_policy.stabilizing(lp)
     done = policy.iterate(lp, found.pair, policy.evaluate(lp, found.pair))
     verified = witness.certify(lp, done.pair, 1e-6, done.value)
     assert verified.certificate.verified
@@ -213,7 +215,7 @@ def test_fast_bounds_agree_with_rationals(seed, scale):
 
 def test_exact_backup_by_hand():
     lp = lm.compile(made(doubling(1.1)))
-    from lmdsl.bounds import exact_backup
+    from lmdsl.certificate.bounds import exact_backup
 
     value = exact_backup(lp, 0, np.array([3.0]), lp.gamma, lp.cost)
     assert value == Fraction(1.1) * 3 / 2 + 1
@@ -239,7 +241,7 @@ def test_certificate_never_imports_a_backend():
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(seed=st.integers(0, 10**6), decades=st.sampled_from([0, 3, 200]))
 def test_directed_sums_are_exact(seed, decades):
-    from lmdsl.sums import weighted
+    from lmdsl.certificate.sums import weighted
 
     rng = np.random.default_rng(seed)
     m = rng.random(7)

@@ -392,7 +392,7 @@ def test_an_internal_error_is_one_message(capsys, file, monkeypatch):
     def explode(*_, **__):
         raise RuntimeError("boom\x1b[31m")
 
-    monkeypatch.setattr(lmdsl.stabilize, "solve", explode)
+    monkeypatch.setattr(lmdsl.results.solving, "solve", explode)
     status, _, err = run(capsys, "solve", file(steps()))
     assert status == 4
     assert "internal error" in err
@@ -405,7 +405,7 @@ def test_interrupt_is_one_message(capsys, file, monkeypatch):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(lmdsl.stabilize, "solve", interrupt)
+    monkeypatch.setattr(lmdsl.results.solving, "solve", interrupt)
     status, _, err = run(capsys, "solve", file(steps()))
     assert status == 130
     assert err == "lmdsl: interrupted\n"

@@ -10,9 +10,10 @@ import pytest
 from problems import doubling, made, steps
 
 import lmdsl as lm
-from lmdsl import controller, result
 from lmdsl.cli import main, solving
-from lmdsl.controller import Simulation
+from lmdsl.control import controller
+from lmdsl.control.controller import Simulation
+from lmdsl.results import result
 
 PENDULUM = {
     "format": "lmdsl/1",

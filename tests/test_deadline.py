@@ -12,12 +12,13 @@ import pytest
 from problems import made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl import stabilize, witness
 from lmdsl.cli import main
-from lmdsl.deadline import Deadline, TimeLimitReached
-from lmdsl.lp import compile
-from lmdsl.threads import in_order
-from lmdsl.transitions import SHORT, unless_short
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
+from lmdsl.machine.threads import in_order
+from lmdsl.model.assembly.transitions import SHORT, unless_short
+from lmdsl.model.lp import compile
+from lmdsl.optimize import witness
+from lmdsl.results import solving
 
 
 class Asked(Deadline):
@@ -109,7 +110,7 @@ def test_the_command_says_so(tmp_path, capsys):
 
 @pytest.mark.parametrize("threads", [1, 2])
 def test_it_ends_within_a_block(monkeypatch, threads):
-    monkeypatch.setattr("lmdsl.threads.count", lambda: threads)
+    monkeypatch.setattr("lmdsl.machine.threads.count", lambda: threads)
     deadline = Asked(200)  # a block of this problem asks 800,000 times
     with pytest.raises(TimeLimitReached):
         compile(made(sines(points=10**6)), None, deadline)
@@ -119,7 +120,7 @@ def test_it_ends_within_a_block(monkeypatch, threads):
 def test_what_compiles_in_a_moment_is_compiled(monkeypatch):
     lp = lm.compile(made(standard_map(20)), time_limit=1e-9)
     assert lp.digest == lm.compile(made(standard_map(20))).digest
-    monkeypatch.setattr("lmdsl.transitions.SHORT", 0)
+    monkeypatch.setattr("lmdsl.model.assembly.transitions.SHORT", 0)
     with pytest.raises(TimeLimitReached):
         lm.compile(made(standard_map(20)), time_limit=1e-9)
     assert SHORT > 0
@@ -133,8 +134,8 @@ def test_a_python_function_is_no_moment():
 
 
 def test_an_interrupt_ends_the_threads_that_help(monkeypatch):
-    monkeypatch.setattr("lmdsl.threads.count", lambda: 2)
-    monkeypatch.setattr("lmdsl.transitions.SHORT", 0)
+    monkeypatch.setattr("lmdsl.machine.threads.count", lambda: 2)
+    monkeypatch.setattr("lmdsl.model.assembly.transitions.SHORT", 0)
     deadline = Deadline()
 
     def interrupt(stage, done):
@@ -146,7 +147,7 @@ def test_an_interrupt_ends_the_threads_that_help(monkeypatch):
 
 
 def test_an_interrupt_does_not_wait_for_the_end_of_a_long_part(monkeypatch):
-    monkeypatch.setattr("lmdsl.threads.count", lambda: 2)
+    monkeypatch.setattr("lmdsl.machine.threads.count", lambda: 2)
     deadline, begun = Deadline(), threading.Event()
 
     def work(part):
@@ -173,13 +174,13 @@ def test_an_interrupt_does_not_wait_for_the_end_of_a_long_part(monkeypatch):
 
 def test_the_restricted_solve_gets_what_is_left(monkeypatch):
     given = []
-    found = stabilize.feasibility.stabilizing
+    found = solving.feasibility.stabilizing
 
     def noted(lp, stop):
         given.append(stop)
         return found(lp, stop)
 
-    monkeypatch.setattr(stabilize.feasibility, "stabilizing", noted)
+    monkeypatch.setattr(solving.feasibility, "stabilizing", noted)
     # Cell 0 of the first half is left half the time; the second half knows no such corner.
     data = {
         "format": "lmdsl/1",
@@ -223,10 +224,10 @@ def local(nodes=5, substeps=2, cells=400):
 
 
 def checked(problem, *arguments, **more):
-    from lmdsl.local import LocalController
-    from lmdsl.local_check import check
-    from lmdsl.partition import Partition
-    from lmdsl.regions import Regions
+    from lmdsl.control.invariance import check
+    from lmdsl.model.grid.partition import Partition
+    from lmdsl.model.local_controller import LocalController
+    from lmdsl.model.sets import Regions
 
     partition = Partition.of(problem)
     attractor = Regions.of(problem, partition).attractor
@@ -349,9 +350,9 @@ def test_many_samples_are_sorted_to_the_same_rows(monkeypatch):
     for data in (standard_map(9), noisy, escaping):
         usual = lm.compile(made(data)).digest
         with monkeypatch.context() as patch:
-            patch.setattr("lmdsl.sampler.CHUNK", 1)
+            patch.setattr("lmdsl.model.assembly.sampler.CHUNK", 1)
             assert lm.compile(made(data)).digest == usual
-            patch.setattr("lmdsl.transitions.MANY", 1)
+            patch.setattr("lmdsl.model.assembly.transitions.MANY", 1)
             assert lm.compile(made(data)).digest == usual
 
 
@@ -361,7 +362,7 @@ def test_many_samples_are_sorted_to_the_same_rows(monkeypatch):
 @pytest.fixture
 def saved(tmp_path, monkeypatch):
     """A result that takes more than a moment to make anew."""
-    monkeypatch.setattr("lmdsl.transitions.SHORT", 0)
+    monkeypatch.setattr("lmdsl.model.assembly.transitions.SHORT", 0)
     lm.solve(made(standard_map(20))).save(tmp_path / "out")
     return str(tmp_path / "out")
 
@@ -383,7 +384,7 @@ def test_verify_ends_and_says_nothing_about_the_claims(saved, capsys):
 
 
 def test_verify_in_rational_arithmetic_asks_between_blocks(saved, monkeypatch):
-    monkeypatch.setattr("lmdsl.rational.BLOCK", 10)
+    monkeypatch.setattr("lmdsl.certificate.exact_sums.BLOCK", 10)
     few, many = Asked(), Asked()
     assert lm.verify(saved, time_limit=few).holds
     assert lm.verify(saved, exact=True, time_limit=many).holds

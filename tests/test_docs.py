@@ -36,9 +36,12 @@ import matplotlib as mpl
 import pytest
 
 import lmdsl as lm
-from lmdsl import archive, backends, cli, comparison, plotting, problem
-from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
-from lmdsl.result import EXIT
+from lmdsl import backends, cli, plotting
+from lmdsl.formulas.language import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
+from lmdsl.problem import problem
+from lmdsl.results import comparison
+from lmdsl.results.directory import archive
+from lmdsl.results.result import EXIT
 from lmdsl.systems import NAMED
 from lmdsl.testing.checks import CHECKS
 
@@ -260,7 +263,7 @@ def test_the_whole_formula_language_is_described():
     grammar = next(b.text for b in blocks(doc("problem-file.md")) if "condition :" in b.text)
     assert grammar.split() == [
         word
-        for line in importlib.import_module("lmdsl.formulas").__doc__.splitlines()
+        for line in importlib.import_module("lmdsl.formulas.language").__doc__.splitlines()
         if line.startswith("    ")
         for word in line.split()
     ]

@@ -10,13 +10,15 @@ from models import random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import backends, elimination, feasibility, policy
+from lmdsl import backends
 from lmdsl.backends import Backend, Solution, Stop
+from lmdsl.optimize.feasibility import first_policy
+from lmdsl.optimize.policies import policy, presolve
 
 
 def first(lp):
-    found = feasibility.stabilizing(lp)
-    assert isinstance(found, feasibility.Feasible)
+    found = first_policy.stabilizing(lp)
+    assert isinstance(found, first_policy.Feasible)
     return found
 
 
@@ -28,7 +30,7 @@ def optimum(lp):
 def left_out_are_worse(lp):
     """Return how many columns are left out; each must cost more than the optimum."""
     found = first(lp)
-    kept = elimination.survivors(lp, found.pair, found.w)
+    kept = presolve.survivors(lp, found.pair, found.w)
     assert (np.diff(kept) > 0).all()
     out = np.setdiff1d(np.arange(lp.K), kept)
     V = optimum(lp)
@@ -49,14 +51,14 @@ def test_random_models(seed):
     gamma = (1.0, 1.01, 0.9)[seed % 3]
     zeros = 0.3 if seed % 2 else 0.0
     lp = random_lp(np.random.default_rng(seed), 30, 4, gamma=gamma, zero=zeros)
-    if isinstance(feasibility.stabilizing(lp), feasibility.Feasible):
+    if isinstance(first_policy.stabilizing(lp), first_policy.Feasible):
         left_out_are_worse(lp)
 
 
 def test_time_is_up():
     lp = lm.compile(made(standard_map(10)))
     found = first(lp)
-    kept = elimination.survivors(lp, found.pair, found.w, lambda: True)
+    kept = presolve.survivors(lp, found.pair, found.w, lambda: True)
     assert np.isin(found.pair, kept).all()
 
 

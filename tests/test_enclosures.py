@@ -10,10 +10,10 @@ import numpy as np
 import precise
 import pytest
 
-from lmdsl.formulas import OPERATIONS, parse
-from lmdsl.intervals import FUNCTION_ULPS, Interval, subtract
-from lmdsl.jets import Jet, apply, enclosure
-from lmdsl.program import Program
+from lmdsl.formulas.enclosures import Jet, apply, enclosure
+from lmdsl.formulas.intervals import FUNCTION_ULPS, Interval, subtract
+from lmdsl.formulas.language import OPERATIONS, parse
+from lmdsl.formulas.program import Program
 
 UNARY = ["sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt"]
 STEPS = ["abs", "sign", "floor", "ceil"]

@@ -10,11 +10,11 @@ import pytest
 from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl import boxes
 from lmdsl.cli import main
 from lmdsl.errors import LmdslError
-from lmdsl.explanation import phase_one
-from lmdsl.partition import Partition
+from lmdsl.explanation.causes import phase_one
+from lmdsl.model.grid import boxes
+from lmdsl.model.grid.partition import Partition
 
 mpl.use("Agg")
 

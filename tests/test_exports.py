@@ -16,10 +16,10 @@ from problems import doubling, made, standard_map, steps
 from random_problems import random_problem
 
 import lmdsl as lm
-from lmdsl.certificate import Witness, check
+from lmdsl.certificate.claims import Witness, check
+from lmdsl.certificate.exact_checks import check_exactly
 from lmdsl.cli import main
-from lmdsl.exact import check_exactly
-from lmdsl.exports import export_certificate, export_drn
+from lmdsl.results.exports import export_certificate, export_drn
 
 SCRIPT = Path(__file__).parents[1] / "tools/check_certificate.py"
 NOISE = {"w": {"values": [0.1, -0.2, 0.02], "weights": [0.1, 0.2, 0.7]}}

@@ -20,11 +20,13 @@ from problems import made
 from test_properties import truly
 
 import lmdsl as lm
-from lmdsl import feasibility, graph, growth, sums
-from lmdsl.certificate import CLAIMS, Witness, check
-from lmdsl.exact import check_exactly
-from lmdsl.rows import Rows, Shares
-from lmdsl.sampling import Nodes
+from lmdsl.certificate import sums
+from lmdsl.certificate.claims import CLAIMS, Witness, check
+from lmdsl.certificate.exact_checks import check_exactly
+from lmdsl.model import stabilizable_set
+from lmdsl.model.discretization import Nodes
+from lmdsl.model.rows import Rows, Shares
+from lmdsl.optimize.feasibility import first_policy, spectral_radius
 
 LARGEST = sys.float_info.max
 NUMBERS = [
@@ -321,7 +323,7 @@ def test_no_check_says_yes_at_length():
 def stabilizable(seed):
     """Return a random model of such numbers, None where it is not all stabilizable."""
     model = Model(np.random.default_rng(seed))
-    found = graph.stabilizable(model.lp.pair_pointer, model.lp.rows)
+    found = stabilizable_set.stabilizable(model.lp.pair_pointer, model.lp.rows)
     return model if found.inside.all() and found.surviving.all() else None
 
 
@@ -367,17 +369,17 @@ def test_solving_ends_at_length():
 def test_a_gamma_out_of_sight_is_decided_soon(monkeypatch):
     """From 1 up to 1e300 by exponents: bisection of the numbers took a thousand proofs a policy."""
     asked = []
-    proof = feasibility.stability_vector
+    proof = first_policy.stability_vector
 
     def counted(*args, **more):
         asked.append(1)
         return proof(*args, **more)
 
-    monkeypatch.setattr(feasibility, "stability_vector", counted)
+    monkeypatch.setattr(first_policy, "stability_vector", counted)
     for gamma in (1e17, 1e300, LARGEST):
         for model in filter(None, map(stabilizable, range(40))):
             before = len(asked)
-            feasibility.stabilizing(replace(model.lp, gamma=gamma))
+            first_policy.stabilizing(replace(model.lp, gamma=gamma))
             assert len(asked) - before < 2000
     assert len(asked) > 100
 
@@ -388,11 +390,11 @@ def test_a_limit_beyond_the_doubles_is_not_called_infinite():
     shares = Shares.of(1, Nodes(np.zeros((2, 1)), weights, np.arange(2)))
     rows = Rows(np.array([0, 2]), np.array([1, 0], np.int32), np.array([0, 1], np.uint8), shares, 1)
     lp = build(np.array([0, 1]), np.zeros(1, np.int32), rows, np.ones(1), 1.0)
-    low = growth.check_low(lp, np.array([0]), np.ones(1))
+    low = spectral_radius.check_low(lp, np.array([0]), np.ones(1))
     assert low == pytest.approx(LARGEST)
     assert low < np.inf
     free = replace(lp, rows=replace(rows, target=np.array([1, 1], np.int32)))
-    assert growth.check_low(free, np.array([0]), np.ones(1)) == np.inf
+    assert spectral_radius.check_low(free, np.array([0]), np.ones(1)) == np.inf
 
 
 # From end to end ----------------------------------------------------------------------------

@@ -18,11 +18,12 @@ import pytest
 from problems import made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl import policy, surroundings
-from lmdsl.asking import ask
 from lmdsl.backends import Backend, Capabilities, Options, Solution, Stop
+from lmdsl.backends.asking import ask
 from lmdsl.cli import main
-from lmdsl.policy import Iteration
+from lmdsl.machine import surroundings
+from lmdsl.optimize.policies import policy
+from lmdsl.optimize.policies.policy import Iteration
 
 PROBLEM = standard_map(10)
 

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from spent import at_most
 
-from lmdsl import formulas
 from lmdsl.errors import BadInput
-from lmdsl.formulas import (
+from lmdsl.formulas import language
+from lmdsl.formulas.language import (
     FORMULA_CONSTANTS,
     FORMULA_FUNCTIONS,
     Formula,
@@ -23,7 +23,7 @@ from lmdsl.formulas import (
     check_name,
     parse,
 )
-from lmdsl.program import Program
+from lmdsl.formulas.program import Program
 
 NAMES = ("u", "x", "y")
 UFUNCS = {
@@ -474,14 +474,14 @@ def program(*texts, constants=None, names=(*NAMES, "K")):
 
 def counting(monkeypatch, name):
     shapes = []
-    original = formulas.OPERATIONS[name]
+    original = language.OPERATIONS[name]
 
     def counted(*arguments, **keywords):
         result = original(*arguments, **keywords)
         shapes.append(np.shape(result))
         return result
 
-    monkeypatch.setitem(formulas.OPERATIONS, name, counted)
+    monkeypatch.setitem(language.OPERATIONS, name, counted)
     return shapes
 
 
@@ -540,7 +540,7 @@ def test_memory_of_a_dead_temporary_is_used_again(monkeypatch):
         targets.append(out is not None)
         return original(*arguments, out=out)
 
-    monkeypatch.setitem(formulas.OPERATIONS, "+", watched)
+    monkeypatch.setitem(language.OPERATIONS, "+", watched)
     x, y = np.ones((4, 1)), np.ones((1, 3))
     program("x + 1 + 2 + y + x")({"x": x, "y": y})
     # an input is never the target; then a temporary; then one too small; then one that fits

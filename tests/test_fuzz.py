@@ -29,10 +29,10 @@ from test_problem import BAD, RAW
 from test_properties import truly
 
 import lmdsl as lm
-from lmdsl.certificate import Witness
+from lmdsl.certificate.claims import Witness
 from lmdsl.cli import main
-from lmdsl.sampling import control_count, noise_nodes, sample_points
-from lmdsl.verification import recompiled
+from lmdsl.model.discretization import control_count, noise_nodes, sample_points
+from lmdsl.results.verification import recompiled
 
 EXAMPLES = [
     json.loads(path.read_text())

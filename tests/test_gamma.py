@@ -15,14 +15,16 @@ from problems import doubling, made, standard_map, steps
 from scipy.sparse.linalg import eigs
 
 import lmdsl as lm
-from lmdsl import feasibility, gamma, growth, linear, types
-from lmdsl.bounds import exactly_below
+from lmdsl.certificate.bounds import exactly_below
 from lmdsl.cli import main
-from lmdsl.directions import Directions
-from lmdsl.gamma import check_high
-from lmdsl.growth import check_low
-from lmdsl.rows import Rows, Shares
-from lmdsl.sampling import Nodes
+from lmdsl.common import types
+from lmdsl.model.discretization import Nodes
+from lmdsl.model.grid.directions import Directions
+from lmdsl.model.rows import Rows, Shares
+from lmdsl.optimize.feasibility import first_policy, gamma, spectral_radius
+from lmdsl.optimize.feasibility.gamma import check_high
+from lmdsl.optimize.feasibility.spectral_radius import check_low
+from lmdsl.optimize.linear import equations
 
 
 def chain(stays: list[int], samples: int = 10) -> lm.StabilizationLP:
@@ -181,17 +183,17 @@ def test_a_width_that_is_none(width):
 def test_the_rate_of_a_large_class_needs_no_factors(shift, monkeypatch):
     """A walk with jumps: 1,500 cells in one class, which sparse factors would fill."""
     rng = np.random.default_rng(3)
-    n = linear.KRYLOV + 500
+    n = equations.KRYLOV + 500
     target = np.concatenate([(np.arange(n) + 1) % n, rng.integers(0, n, 3 * n)])
     weight = rng.random(4 * n) + shift
     M = sp.csr_array((weight, (np.tile(np.arange(n), 4), target)), (n, n))
     M = sp.csr_array(M / (1.1 * M.sum(axis=1).max()))
-    monkeypatch.setattr(linear, "solve_by_class", None)
-    x, rate, least = growth._perron(M, types.never, 0.0, Directions.line(n))
+    monkeypatch.setattr(equations, "solve_by_class", None)
+    x, rate, least = spectral_radius._perron(M, types.never, 0.0, Directions.line(n))
     assert (x > 0).all()
     assert least <= rate <= least * (1 + 1e-9)
     assert rate == pytest.approx(abs(eigs(M, k=1, return_eigenvectors=False)[0]), rel=1e-9)
-    early = growth._perron(M, types.never, 2 * rate, Directions.line(n))
+    early = spectral_radius._perron(M, types.never, 2 * rate, Directions.line(n))
     assert rate < early[1] < 2 * rate
 
 
@@ -224,7 +226,7 @@ def integrator(cells: int, gamma_value: float = 1.0) -> dict:
 def test_long_ways_take_few_policies(monkeypatch):
     """Howard's iteration on the vectors of the classes, not hundreds of stopping policies."""
     lp, calls = lm.compile(made(integrator(60))), []
-    for module, name in ((growth, "of_policy"), (feasibility, "_stopped")):
+    for module, name in ((spectral_radius, "of_policy"), (first_policy, "_stopped")):
         inner = getattr(module, name)
 
         def counted(*args, inner=inner):
@@ -251,10 +253,10 @@ def test_improving_a_policy_never_lowers_its_limit(seed):
     lp = random_lp(np.random.default_rng(seed), cells=8, controls=4, absorb=0.3)
     if not lp.n:
         return
-    first = growth.of_policy(lp, lp.tree[1])
-    better = growth.improved(lp, first)
+    first = spectral_radius.of_policy(lp, lp.tree[1])
+    better = spectral_radius.improved(lp, first)
     assert better.limit >= first.limit * (1 - 1e-12)
-    proved = growth.prove_low(lp, better)
+    proved = spectral_radius.prove_low(lp, better)
     assert proved is not None
     assert proved[0] <= better.limit * (1 + 1e-12)
 

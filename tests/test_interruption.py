@@ -19,7 +19,11 @@ from models import mdp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import deadline, feasibility, gamma, linear, policy, saving
+from lmdsl.machine import deadline
+from lmdsl.optimize.feasibility import first_policy, gamma
+from lmdsl.optimize.linear import equations
+from lmdsl.optimize.policies import policy
+from lmdsl.results.directory import writing
 
 HERE = Path(__file__).parent
 posix = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and signals")
@@ -62,7 +66,7 @@ def test_killed_at_every_line(tmp_path, new):
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # from the tracing
 def test_interrupted_at_every_line_of_a_save(tmp_path, monkeypatch):
     """Ctrl-C during a save never loses the directory: it is the old one or the new one."""
-    monkeypatch.setattr(saving, "PATIENCE", 0.0)  # a lock may stay until the process ends
+    monkeypatch.setattr(writing, "PATIENCE", 0.0)  # a lock may stay until the process ends
     monkeypatch.setattr(os, "fsync", lambda _: None)
     results = interrupted_saves.solved()
     target = tmp_path / "out"
@@ -307,7 +311,7 @@ def slow(n=4):
 
 
 def test_a_time_limit_holds_within_the_sweeps_of_one_evaluation(monkeypatch):
-    monkeypatch.setattr(linear, "MAX_FACTORED", 0)  # as if the class were too large to factor
+    monkeypatch.setattr(equations, "MAX_FACTORED", 0)  # as if the class were too large to factor
     lp = slow()
     pair = np.arange(lp.n)
     asked = itertools.count()
@@ -318,9 +322,9 @@ def test_a_time_limit_holds_within_the_sweeps_of_one_evaluation(monkeypatch):
     with pytest.raises(deadline.Stopped):
         policy.evaluate(lp, pair, stop=late)
     assert next(asked) < 105
-    assert isinstance(feasibility.stabilizing(lp, late), feasibility.Undecided)
+    assert isinstance(first_policy.stabilizing(lp, late), first_policy.Undecided)
     assert (
-        feasibility.optimal_stopping(lp, 1.1, np.ones(lp.n), pair, np.ones(4, bool), late) is None
+        first_policy.optimal_stopping(lp, 1.1, np.ones(lp.n), pair, np.ones(4, bool), late) is None
     )
     found = gamma.bracket(lp, late)
     assert "ended before" in found.note

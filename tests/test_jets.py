@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import lmdsl as lm
-from lmdsl.formulas import parse
-from lmdsl.intervals import Interval
-from lmdsl.jets import Jet
-from lmdsl.program import Program
+from lmdsl.formulas.enclosures import Jet
+from lmdsl.formulas.intervals import Interval
+from lmdsl.formulas.language import parse
+from lmdsl.formulas.program import Program
 
 UNARY = ["sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt",
          "abs", "sign", "floor", "ceil"]  # fmt: skip

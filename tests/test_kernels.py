@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmdsl import kernels
 from lmdsl.cli.output import Narrator
+from lmdsl.machine import kernels
 
 ROOT = Path(__file__).parent.parent
 
@@ -162,11 +162,11 @@ def test_a_change_in_a_kernel_or_constant_of_another_file_is_noticed(
     monkeypatch.setattr(kernels, "folders", lambda: (folder / "kept",))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     called = (
-        "from lmdsl.kernels import kernel\n\nSTEP = 1.0\nunrelated = 1\n\n\n"
+        "from lmdsl.machine.kernels import kernel\n\nSTEP = 1.0\nunrelated = 1\n\n\n"
         '@kernel\ndef add(x):\n    """Add."""\n    return x + STEP\n'
     )
     caller = (
-        "from called import add\nfrom lmdsl.kernels import kernel\n\n\n"
+        "from called import add\nfrom lmdsl.machine.kernels import kernel\n\n\n"
         "@kernel\ndef twice(x):\n    return add(add(x))\n"
     )
 

@@ -178,7 +178,7 @@ def test_ode_is_integrated_by_runge_kutta():
 
 
 def test_gauss_hermite_moments():
-    from lmdsl.sampling import noise_nodes
+    from lmdsl.model.discretization import noise_nodes
 
     data = steps(1.0)
     data["noise"] = {"w": {"normal": {"std": 0.3, "points": 5}}}

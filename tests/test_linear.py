@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from lmdsl import linear, sweeps
-from lmdsl.sweeps import System
+from lmdsl.optimize.linear import equations, gauss_seidel
+from lmdsl.optimize.linear.gauss_seidel import System
 
 
 def sparse(n, rng, density=0.06, largest=0.9):
@@ -21,7 +21,7 @@ def test_every_class_comes_after_all_it_leads_to(density):
     rng, several = np.random.default_rng(0), 0
     for _ in range(30):
         M = sparse(40, rng, density)
-        order, ends = linear.classes(M)
+        order, ends = equations.classes(M)
         assert sorted(order) == list(range(40))
         label = np.empty(40, dtype=int)
         label[order] = np.repeat(np.arange(len(ends)), np.diff(ends, prepend=0))
@@ -37,7 +37,7 @@ def test_class_by_class_is_the_solution():
     rng = np.random.default_rng(1)
     for _ in range(40):
         M, b = sparse(40, rng), rng.random(40) * (rng.random(40) < 0.3)
-        x, tried = linear.solve_by_class(M, b)
+        x, tried = equations.solve_by_class(M, b)
         assert tried
         expected = np.linalg.solve(np.eye(40) - M.toarray(), b)
         np.testing.assert_allclose(x, expected, rtol=1e-11, atol=1e-300)
@@ -46,8 +46,8 @@ def test_class_by_class_is_the_solution():
 @pytest.mark.parametrize("own", [1.0, 1.5])
 def test_a_cell_that_keeps_all_of_itself_costs_nothing_or_has_no_solution(own):
     M = sp.csr_array(np.array([[own, 0.0], [0.5, 0.0]]))
-    assert linear.solve_by_class(M, np.array([1.0, 1.0])) == (None, True)
-    x, _ = linear.solve_by_class(M, np.array([0.0, 1.0]))
+    assert equations.solve_by_class(M, np.array([1.0, 1.0])) == (None, True)
+    x, _ = equations.solve_by_class(M, np.array([0.0, 1.0]))
     np.testing.assert_array_equal(x, [0.0, 1.0])
 
 
@@ -56,12 +56,12 @@ def test_where_something_is_paid():
     for _ in range(30):
         M, b = sparse(60, rng, 0.02), np.where(rng.random(60) < 0.05, 1.0, 0.0)
         reach = np.linalg.matrix_power((M.toarray() > 0) + np.eye(60), 60) > 0
-        np.testing.assert_array_equal(linear._pays(System.of(M), b), reach @ (b > 0))
+        np.testing.assert_array_equal(equations._pays(System.of(M), b), reach @ (b > 0))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
 def test_each_half_sees_the_other_as_it_was_before_the_sweep(count, monkeypatch):
-    monkeypatch.setattr(sweeps, "SPLIT", 1)
+    monkeypatch.setattr(gauss_seidel, "SPLIT", 1)
     rng = np.random.default_rng(count)
     for n in (2, 7, 50):
         M, b, x = sparse(n, rng, 0.5).toarray(), rng.random(n), rng.random(n)
@@ -82,7 +82,7 @@ def test_each_half_sees_the_other_as_it_was_before_the_sweep(count, monkeypatch)
 
 @pytest.mark.parametrize("split", [1, 10**9])
 def test_sweeps_that_diverge_say_so(split, monkeypatch):
-    monkeypatch.setattr(sweeps, "SPLIT", split)
+    monkeypatch.setattr(gauss_seidel, "SPLIT", split)
     M = sp.csr_array(np.array([[0.0, 3.0], [3.0, 0.0]]))
     x = np.ones(2)
     assert System.of(M).sweep(np.ones(2), x, 2_000)[1] == np.inf

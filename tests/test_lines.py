@@ -6,13 +6,13 @@ from problems import made, standard_map
 from random_problems import random_problem
 
 import lmdsl as lm
-from lmdsl import lines, sampler
-from lmdsl.formulas import parse
-from lmdsl.lines import Lines
-from lmdsl.partition import Partition
-from lmdsl.program import Program
-from lmdsl.regions import Regions
-from lmdsl.sampler import Sampler
+from lmdsl.formulas.language import parse
+from lmdsl.formulas.program import Program
+from lmdsl.model.assembly import lines, sampler
+from lmdsl.model.assembly.lines import Lines
+from lmdsl.model.assembly.sampler import Sampler
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.sets import Regions
 
 
 def sampled(problem):

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl.intervals import Interval
-from lmdsl.jets import Jet, apply
-from lmdsl.local import LocalController
-from lmdsl.local_check import check
-from lmdsl.partition import Partition
-from lmdsl.regions import Regions
+from lmdsl.control.invariance import check
+from lmdsl.formulas.enclosures import Jet, apply
+from lmdsl.formulas.intervals import Interval
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local_controller import LocalController
+from lmdsl.model.sets import Regions
 
 ORBIT = [{"x": 0.25, "y": 0.5}, {"x": 0.75, "y": 0.5}]
 
@@ -331,7 +331,7 @@ def test_a_long_enclosure_stops_in_time(monkeypatch):
     data["state_box"]["x0"]["cells"] = 100_000
     problem = made(data)
     assert check(problem, local_of(problem)).proved == 90_000
-    monkeypatch.setattr("lmdsl.local_check.WORK", 1e5)
+    monkeypatch.setattr("lmdsl.control.invariance.WORK", 1e5)
     found = check(problem, local_of(problem))
     assert 0 < found.proved < found.cells  # what the work allowed
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from problems import doubling, made, steps
 
 import lmdsl as lm
-from lmdsl.axis import EDGE, MOST_TURNS, Axis
-from lmdsl.partition import Partition
-from lmdsl.sampler import Sampler
+from lmdsl.model.assembly.sampler import Sampler
+from lmdsl.model.grid.axis import EDGE, MOST_TURNS, Axis
+from lmdsl.model.grid.partition import Partition
 
 MOST = 2**31 - 2
 

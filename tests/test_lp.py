@@ -11,10 +11,10 @@ from models import dense, random_lp
 from problems import made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl import graph
-from lmdsl.graph import CellStatus, stabilizable, tree
-from lmdsl.rows import Shares
-from lmdsl.sampling import Nodes
+from lmdsl.model import stabilizable_set
+from lmdsl.model.discretization import Nodes
+from lmdsl.model.rows import Shares
+from lmdsl.model.stabilizable_set import CellStatus, stabilizable, tree
 
 
 def test_A_b_c_by_hand():
@@ -134,7 +134,7 @@ def brute_stabilizable(pairs, cells):
 def test_stabilizable_set_by_definition(seed):
     from models import build
 
-    from lmdsl.rows import Rows
+    from lmdsl.model.rows import Rows
 
     rng = np.random.default_rng(seed)
     cells = int(rng.integers(1, 9))
@@ -173,7 +173,7 @@ def test_stabilizable_set_by_definition(seed):
 @pytest.mark.parametrize("patience", [0, 0.5, 8])
 def test_levels_by_sweeps_and_by_search_are_the_same(patience, monkeypatch):
     """By definition: one more than the least level entered, by the first pair that enters it."""
-    monkeypatch.setattr(graph, "PATIENCE", patience)
+    monkeypatch.setattr(stabilizable_set, "PATIENCE", patience)
     rng = np.random.default_rng(5)
     for _ in range(40):
         lp = random_lp(rng, 30, controls=5, absorb=0.05)
@@ -246,7 +246,7 @@ def test_memory_is_bounded_by_chunks():
 
 
 def test_controls_in_blocks_equal_controls_at_once(monkeypatch):
-    from lmdsl import sampler
+    from lmdsl.model.assembly import sampler
 
     data = standard_map(8)
     whole = lm.compile(made(data))

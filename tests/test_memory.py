@@ -2,8 +2,8 @@
 
 import pytest
 
-from lmdsl import memory
 from lmdsl.errors import BadInput
+from lmdsl.machine import memory
 
 GB = 2**30
 NOTHING = {}

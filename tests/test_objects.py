@@ -13,8 +13,8 @@ import pytest
 from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
+from lmdsl.common.frozen import Frozen
 from lmdsl.errors import LmdslError, MissingDependency
-from lmdsl.frozen import Frozen
 
 NOISE = {"w": {"values": [-0.01, 0.01], "weights": [0.5, 0.5]}}
 LOCAL = {"local_controller": {"kind": "constant", "control": {"u": 0}}}

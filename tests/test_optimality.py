@@ -7,8 +7,9 @@ import pytest
 from models import brute_force, dense, mdp, random_lp
 
 import lmdsl as lm
-from lmdsl import feasibility, policy
-from lmdsl.bounds import exactly_below
+from lmdsl.certificate.bounds import exactly_below
+from lmdsl.optimize.feasibility import first_policy
+from lmdsl.optimize.policies import policy
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.05, 1.3, 2.0])
@@ -90,8 +91,8 @@ def test_canonical_policy_does_not_depend_on_the_start(seed):
     lp = random_lp(rng, cells=7, controls=4, gamma=1.0, zero=0.8, samples=4)
     if not lp.n:
         return
-    found = feasibility.stabilizing(lp)
-    assert isinstance(found, feasibility.Feasible)
+    found = first_policy.stabilizing(lp)
+    assert isinstance(found, first_policy.Feasible)
     ends = []
     for start in (found.pair, _random_proper(lp, rng)):
         value = policy.evaluate(lp, start)

@@ -16,9 +16,11 @@ import pytest
 from problems import made, steps
 
 import lmdsl as lm
-from lmdsl import backends, files, quiet
+from lmdsl import backends
 from lmdsl.cli import main
+from lmdsl.common import files
 from lmdsl.errors import printable
+from lmdsl.machine import quiet
 
 posix = pytest.mark.skipif(os.name != "posix", reason="descriptors of POSIX")
 ROOT = Path(lm.__file__).parents[1]
@@ -162,7 +164,7 @@ print("after")
 def test_python_prints_nothing_of_a_solver(tmp_path, noisy):
     (tmp_path / "quiet.py").write_text(QUIET.replace("import noisy\n", "", 1).replace(
         "problem =", "with lm.quiet.foreign():\n    import noisy\nproblem =", 1
-    ).replace("import lmdsl as lm", "import lmdsl as lm\nimport lmdsl.quiet"))  # fmt: skip
+    ).replace("import lmdsl as lm", "import lmdsl as lm\nimport lmdsl.machine.quiet"))  # fmt: skip
     done = python(tmp_path, noisy, "quiet.py")
     assert done.returncode == 0, done.stderr
     words = done.stdout.split(" ")

@@ -16,10 +16,12 @@ from models import dense, random_lp
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu, spsolve
 
-from lmdsl import linear, peeling, rows, threads
-from lmdsl.peeling import Peeled
-from lmdsl.slots import Slots
-from lmdsl.sweeps import System
+from lmdsl.machine import threads
+from lmdsl.model import rows
+from lmdsl.optimize.linear import equations, substitution
+from lmdsl.optimize.linear.gauss_seidel import System
+from lmdsl.optimize.linear.policy_system import Slots
+from lmdsl.optimize.linear.substitution import Peeled
 
 
 def matrix(seed, n, cyclic, radius=0.9):
@@ -69,13 +71,13 @@ def test_solutions_agree_with_dense_ones(seed, n, cyclic):
     b = rng.random(n) * (rng.random(n) < 0.7)  # some exact zeros
     peeled, whole = Peeled.of(System.of(M)), np.eye(n) - M.toarray()
     x = rng.random(n)
-    assert linear.solve_from(peeled, b, x, lambda: M)
+    assert equations.solve_from(peeled, b, x, lambda: M)
     np.testing.assert_allclose(x, np.linalg.solve(whole, b), rtol=1e-12, atol=1e-15)
-    mu = linear.solve_transposed(peeled, b, lambda: M)
+    mu = equations.solve_transposed(peeled, b, lambda: M)
     np.testing.assert_allclose(mu, np.linalg.solve(whole.T, b), rtol=1e-11, atol=1e-15)
     for start in (None, rng.random(n)):
         np.testing.assert_array_equal(
-            linear.solve_transposed(peeled, np.zeros(n), lambda: M, start=start), 0
+            equations.solve_transposed(peeled, np.zeros(n), lambda: M, start=start), 0
         )
 
 
@@ -87,7 +89,7 @@ def test_advancing_stays_on_its_side(seed, n, cyclic):
     for factor in (0.5, 2.0):  # below b + M x, and above
         x = factor * exact
         before = x.copy()
-        linear.advance(Peeled.of(System.of(M)), b, x, 2, 0.0, 0.0)
+        equations.advance(Peeled.of(System.of(M)), b, x, 2, 0.0, 0.0)
         ahead = b + M @ x
         if factor < 1:
             assert (x >= before * (1 - 1e-13)).all()
@@ -126,7 +128,7 @@ def test_a_walk_in_from_both_ends_is_peeled_pair_by_pair():
 def test_large_levels_in_several_threads(monkeypatch, many, workers):
     M = matrix(3, 300, 5)
     peeled, b = Peeled.of(System.of(M)), np.random.default_rng(0).random(300)
-    monkeypatch.setattr(peeling, "MANY", many)
+    monkeypatch.setattr(substitution, "MANY", many)
     monkeypatch.setattr(threads, "count", lambda: workers)
     x = np.linalg.solve(np.eye(300) - M.toarray(), b)
     y = np.where(np.isin(np.arange(300), peeled.core), x, np.nan)
@@ -141,7 +143,7 @@ def test_a_system_without_cycles_is_solved_at_once():
     peeled = Peeled.of(System.of(M))
     assert not len(peeled.core)
     x = np.zeros(200)
-    assert linear.advance(peeled, np.ones(200), x, 1, 0.0, 0.0) == 0.0
+    assert equations.advance(peeled, np.ones(200), x, 1, 0.0, 0.0) == 0.0
     np.testing.assert_allclose(x - M @ x, 1.0, rtol=1e-13)
 
 
@@ -150,10 +152,10 @@ def test_staying_for_ever_has_no_solution_where_something_is_paid(own):
     M = sp.csr_array(np.array([[own, 0.0], [0.5, 0.0]]))
     peeled = Peeled.of(System.of(M))
     for b in (np.array([1e-200, 1.0]), np.array([1.0, 0.0])):
-        assert not linear.solve_from(peeled, b, b.copy(), lambda: M)
-        assert linear.advance(peeled, b, b.copy(), 9, 0.0, 0.0) == np.inf
+        assert not equations.solve_from(peeled, b, b.copy(), lambda: M)
+        assert equations.advance(peeled, b, b.copy(), 9, 0.0, 0.0) == np.inf
     x = np.zeros(2)
-    assert linear.solve_from(peeled, np.array([0.0, 1.0]), x, lambda: M)
+    assert equations.solve_from(peeled, np.array([0.0, 1.0]), x, lambda: M)
     np.testing.assert_array_equal(x, [0.0, 1.0])
 
 
@@ -161,7 +163,7 @@ def test_a_growing_cycle_has_no_solution():
     M = sp.csr_array(np.array([[0.0, 1.1, 0.0], [1.0, 0.0, 0.0], [0.5, 0.5, 0.0]]))
     peeled = Peeled.of(System.of(M))
     assert list(peeled.core) == [0, 1]
-    assert not linear.solve_from(peeled, np.ones(3), np.ones(3), lambda: M)
+    assert not equations.solve_from(peeled, np.ones(3), np.ones(3), lambda: M)
 
 
 def well_mixed(n, escape):
@@ -180,9 +182,9 @@ def test_well_mixed_systems_are_solved_without_factors(monkeypatch, zeros, scale
     if zeros:
         b[100:] = 0.0
     exact = spsolve(sp.eye_array(1200, format="csc") - M.tocsc(), b)
-    monkeypatch.setattr(linear, "solve_by_class", lambda *_: pytest.fail("it was factored"))
-    np.testing.assert_allclose(linear.solve(M, b), exact, rtol=1e-9)
-    mu = linear.solve_transposed(Peeled.of(System.of(M)), b, lambda: M)
+    monkeypatch.setattr(equations, "solve_by_class", lambda *_: pytest.fail("it was factored"))
+    np.testing.assert_allclose(equations.solve(M, b), exact, rtol=1e-9)
+    mu = equations.solve_transposed(Peeled.of(System.of(M)), b, lambda: M)
     np.testing.assert_allclose(mu - M.T @ mu, b, atol=1e-11 * mu.max())
 
 
@@ -198,13 +200,13 @@ def test_factors_in_several_threads_leave_the_filters_of_warnings_alone(monkeypa
         warnings.simplefilter("default")
         before = list(warnings.filters)
         with ThreadPoolExecutor(3) as pool:
-            list(pool.map(lambda _: linear._factors(M), range(3)))
+            list(pool.map(lambda _: equations._factors(M), range(3)))
         assert list(warnings.filters) == before
 
 
 def test_a_well_mixed_system_that_grows_has_no_solution():
     M = well_mixed(1100, -1e-3)
-    assert linear.solve(M, np.ones(1100)) is None
+    assert equations.solve(M, np.ones(1100)) is None
 
 
 @pytest.mark.parametrize("seed", range(12))

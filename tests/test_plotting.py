@@ -15,10 +15,11 @@ import pytest
 from problems import doubling, made, standard_map
 
 import lmdsl as lm
-from lmdsl import memory, plotting
-from lmdsl.drawing import layers, runs
-from lmdsl.drawing.view import View, number, plain, rectangles, segments
+from lmdsl import plotting
 from lmdsl.errors import MissingDependency
+from lmdsl.machine import memory
+from lmdsl.plotting import layers, runs
+from lmdsl.plotting.view import View, number, plain, rectangles, segments
 
 MATPLOTLIB = pytest.importorskip("matplotlib")
 SIGNATURES = {"png": b"\x89PNG\r\n\x1a\n", "pdf": b"%PDF-", "svg": b"<?xml"}
@@ -527,7 +528,7 @@ def test_a_function_that_was_not_stored_leaves_its_panels_empty(tmp_path):
 
 
 def test_a_million_cells_are_drawn_in_bounded_work():
-    from lmdsl.partition import Partition
+    from lmdsl.model.grid.partition import Partition
 
     data = standard_map(1000)
     partition = Partition.of(made(data))

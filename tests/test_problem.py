@@ -290,7 +290,7 @@ def test_problems_are_frozen():
 
 
 def test_python_declaration_equals_the_file():
-    from lmdsl.problem import Attractor, Axis, ControlRange, Problem, Random
+    from lmdsl.problem.problem import Attractor, Axis, ControlRange, Problem, Random
     from lmdsl.systems import StandardMap
 
     problem = Problem(
@@ -311,7 +311,7 @@ def test_python_declaration_equals_the_file():
 
 
 def test_python_errors_are_bad_input_too():
-    from lmdsl.problem import Axis
+    from lmdsl.problem.problem import Axis
 
     with pytest.raises(lm.BadInput, match="less than"):
         Axis(low=1, high=0, cells=3)

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from models import mdp, random_lp
 
 import lmdsl as lm
-from lmdsl.certificate import Witness, check
-from lmdsl.exact import check_exactly
+from lmdsl.certificate.claims import Witness, check
+from lmdsl.certificate.exact_checks import check_exactly
 
 SAMPLES = 6
 CLAIMS = ("stabilizing", "upper_bound", "lower_bound", "measure")

@@ -12,7 +12,12 @@ from models import mdp, random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import bellman, certificate, linear, peeling, rows, sweeps, threads, vectors, witness
+from lmdsl.certificate import claims
+from lmdsl.machine import threads
+from lmdsl.model import rows, vectors
+from lmdsl.optimize import witness
+from lmdsl.optimize.linear import equations, gauss_seidel, substitution
+from lmdsl.optimize.policies import bellman
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -20,8 +25,8 @@ def test_ranges_and_halves_give_the_same_policy(monkeypatch, workers):
     problem = made(standard_map(16))
     whole = lm.solve(problem)
     monkeypatch.setattr(vectors, "GRAIN", 1)
-    monkeypatch.setattr(sweeps, "SPLIT", 1)
-    for room in (rows, peeling, certificate, witness):
+    monkeypatch.setattr(gauss_seidel, "SPLIT", 1)
+    for room in (rows, substitution, claims, witness):
         monkeypatch.setattr(room, "MANY", 1)
     monkeypatch.setattr(threads, "count", lambda: workers)
     parts = lm.solve(problem)
@@ -36,8 +41,8 @@ def test_halves_solve_the_system(monkeypatch):
     M = sp.csr_array(rng.random((n, n)) * (rng.random((n, n)) < 0.1))
     M.data *= 0.9 / np.maximum(M.sum(axis=1), 1e-9).max()
     b = rng.random(n)
-    monkeypatch.setattr(sweeps, "SPLIT", 1)
-    x = linear.solve(M, b)
+    monkeypatch.setattr(gauss_seidel, "SPLIT", 1)
+    x = equations.solve(M, b)
     np.testing.assert_allclose(x, np.linalg.solve(np.eye(n) - M.toarray(), b), rtol=1e-12)
 
 

@@ -10,7 +10,7 @@ from problems import made, standard_map
 from test_local import ORBIT, linear_system, local_of
 
 import lmdsl as lm
-from lmdsl import riccati
+from lmdsl.model import riccati
 
 
 def gain(A, B, Q, R):

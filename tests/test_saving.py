@@ -18,8 +18,9 @@ import pytest
 from problems import made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl import archive, files, folder, saving
 from lmdsl.cli import main
+from lmdsl.common import files
+from lmdsl.results.directory import archive, reading, writing
 from lmdsl.systems import FunctionSystem
 
 OURS = {"certificate.json", "problem.json", "solution.npz"}
@@ -221,7 +222,7 @@ def test_a_mount_point(tmp_path, results, monkeypatch, held):
         results[0].save(target)
     elif held:
         (target / held[0]).mkdir()
-    monkeypatch.setattr(saving.os, "rename", refusing(errno.EBUSY))
+    monkeypatch.setattr(writing.os, "rename", refusing(errno.EBUSY))
     monkeypatch.setattr(os, "rmdir", refusing(errno.EBUSY))
     results[1].save(target)
     assert interrupted_saves.gamma_held(target, results) == 1.01
@@ -245,7 +246,7 @@ def test_a_directory_that_fails_half_way(tmp_path, results, monkeypatch, at):
     target = tmp_path / "out"
     results[0].save(target)
     with monkeypatch.context() as patch:
-        patch.setattr(saving.os, "replace", broken(errno.EIO, at))
+        patch.setattr(writing.os, "replace", broken(errno.EIO, at))
         with pytest.raises(lm.BadInput, match="input/output error"):
             results[1].save(target)
     assert interrupted_saves.gamma_held(target, results) == (1.0 if at == 1 else 1.01)
@@ -262,7 +263,7 @@ def test_a_full_disk(tmp_path, results, monkeypatch, there, at):
     if there:
         results[0].save(target)
     before = {p.name: p.read_bytes() for p in target.iterdir()} if there else {}
-    true, count = saving.write_new, itertools.count(1)
+    true, count = writing.write_new, itertools.count(1)
 
     def full(path, pieces):
         if next(count) >= at:
@@ -270,7 +271,7 @@ def test_a_full_disk(tmp_path, results, monkeypatch, there, at):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         true(path, pieces)
 
-    monkeypatch.setattr(saving, "write_new", full)
+    monkeypatch.setattr(writing, "write_new", full)
     with pytest.raises(lm.BadInput, match="no space left"):
         results[1].save(target)
     assert {p.name: p.read_bytes() for p in target.iterdir()} == before if there else True
@@ -285,14 +286,14 @@ def test_a_result_that_cannot_be_saved_is_rescued(tmp_path, file, monkeypatch, c
     home = tmp_path / "home"
     home.mkdir()
     monkeypatch.setattr(archive.tempfile, "tempdir", str(home))
-    true = saving.write
+    true = writing.write
 
     def fails(target, *rest):
         if target == tmp_path / "out":
             raise OSError(errno.EROFS, "Read-only file system")
         true(target, *rest)
 
-    monkeypatch.setattr(saving, "write", fails)
+    monkeypatch.setattr(writing, "write", fails)
     assert main(["solve", file, "--out", str(tmp_path / "out"), *form]) == 2
     said = capsys.readouterr()
     assert "verified" in said.out
@@ -303,7 +304,7 @@ def test_a_result_that_cannot_be_saved_is_rescued(tmp_path, file, monkeypatch, c
     assert "read-only file system" in said.err
     assert str(saved) in said.err
     assert lm.verify(saved).holds
-    monkeypatch.setattr(saving, "write", refusing(errno.ENOSPC))
+    monkeypatch.setattr(writing, "write", refusing(errno.ENOSPC))
     monkeypatch.chdir(home)
     monkeypatch.setattr(archive.Path, "home", lambda: home)
     shutil.rmtree(saved.parent)
@@ -405,7 +406,7 @@ def test_a_replaced_certificate_is_noticed(tmp_path, results, monkeypatch):
     stored = json.loads((target / "certificate.json").read_text())
     del stored["save"], stored["files"]
     (target / "certificate.json").write_text(json.dumps(stored))
-    true, done = folder.Reading._opened, []
+    true, done = reading.Reading._opened, []
 
     def opened(self, name):
         if not done:
@@ -413,7 +414,7 @@ def test_a_replaced_certificate_is_noticed(tmp_path, results, monkeypatch):
             results[1].save(target)
         return true(self, name)
 
-    monkeypatch.setattr(folder.Reading, "_opened", opened)
+    monkeypatch.setattr(reading.Reading, "_opened", opened)
     assert interrupted_saves.gamma_held(target, results) == 1.01
 
 
@@ -421,8 +422,8 @@ def test_a_replaced_certificate_is_noticed(tmp_path, results, monkeypatch):
 def test_reading_while_others_write(tmp_path, results, writers, locks, monkeypatch):
     """Where locks are refused, several writers may make a reader refuse, but never believe."""
     target = tmp_path / "out"
-    if not locks and saving.fcntl:
-        monkeypatch.setattr(saving.fcntl, "flock", refusing(errno.EBADF))
+    if not locks and writing.fcntl:
+        monkeypatch.setattr(writing.fcntl, "flock", refusing(errno.EBADF))
     results[0].save(target)
     stop, failures = threading.Event(), []
 
@@ -438,7 +439,7 @@ def test_reading_while_others_write(tmp_path, results, writers, locks, monkeypat
             while not stop.is_set():
                 try:
                     assert interrupted_saves.gamma_held(target, results) in (1.0, 1.01, 1.02)
-                except folder.Mixture:
+                except reading.Mixture:
                     assert writers > 1
                     assert not locks
         except BaseException as error:

@@ -17,8 +17,8 @@ from test_fuzz import spoiled_file
 from test_problem import BAD, NOISE
 
 import lmdsl as lm
-from lmdsl.files import strict_json
-from lmdsl.problem import json_schema, parse_problem
+from lmdsl.common.files import strict_json
+from lmdsl.problem.problem import json_schema, parse_problem
 
 WORDS = {
     "$defs", "$ref", "$schema", "additionalProperties", "allOf",

@@ -10,8 +10,10 @@ from models import random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl import bellman, feasibility, policy, vectors
-from lmdsl.screening import Screen
+from lmdsl.model import vectors
+from lmdsl.optimize.feasibility import first_policy
+from lmdsl.optimize.policies import bellman, policy
+from lmdsl.optimize.policies.screening import Screen
 
 MARGIN = 1e-12
 
@@ -60,8 +62,8 @@ def paths():
 
 
 def begun(lp):
-    found = feasibility.stabilizing(lp)
-    if not isinstance(found, feasibility.Feasible):
+    found = first_policy.stabilizing(lp)
+    if not isinstance(found, first_policy.Feasible):
         return None
     return found.pair, policy.bound(lp, found.pair, found.w)
 

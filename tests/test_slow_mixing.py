@@ -7,8 +7,11 @@ from problems import made, standard_map
 from test_evaluation import above, exact, mixing, transport
 
 import lmdsl as lm
-from lmdsl import feasibility, linear, policy, sweeps, types
-from lmdsl.peeling import Peeled
+from lmdsl.common import types
+from lmdsl.optimize.feasibility import first_policy
+from lmdsl.optimize.linear import equations, gauss_seidel
+from lmdsl.optimize.linear.substitution import Peeled
+from lmdsl.optimize.policies import policy
 
 
 def killed(kill, cost="1", gamma=1.0, cells=40):
@@ -39,7 +42,7 @@ def killed(kill, cost="1", gamma=1.0, cells=40):
 def test_where_all_runs_last_as_long_the_first_bound_is_the_value(kill, gamma):
     """No step is made for differences that are rounding."""
     lp = lm.compile(made(killed(kill, gamma=gamma)))
-    first = feasibility.stabilizing(lp)
+    first = first_policy.stabilizing(lp)
     start = policy.bound(lp, first.pair, first.w)
     done = policy.iterate(lp, first.pair, start)
     np.testing.assert_allclose(start, 1 / (1 - gamma * (1 - kill)), rtol=1e-8)
@@ -63,7 +66,7 @@ def test_descending_stays_above_the_equation(escape, make):
     b = rng.uniform(0.5, 2.0, 400)
     x = above(M, b, rng)
     before = x.copy()
-    assert linear.descend(Peeled.of(sweeps.System.of(M)), b, x, 1e-6)
+    assert equations.descend(Peeled.of(gauss_seidel.System.of(M)), b, x, 1e-6)
     assert (x <= before).all()
     assert (x >= (b + M @ x) * (1 - 1e-12)).all()
     np.testing.assert_allclose(x, exact(M, b), rtol=1e-3)
@@ -73,7 +76,9 @@ def test_descending_refuses_what_has_no_solution():
     rng = np.random.default_rng(2)
     M, b = mixing(300, -0.01, rng), np.ones(300)
     x = np.full(300, 1e9)
-    assert not linear.descend(Peeled.of(sweeps.System.of(M)), b, x, 1e-6) or (x == 1e9).all()
+    assert (
+        not equations.descend(Peeled.of(gauss_seidel.System.of(M)), b, x, 1e-6) or (x == 1e9).all()
+    )
 
 
 @pytest.mark.parametrize("patience", [0, 10**9])
@@ -89,5 +94,5 @@ def test_the_optimum_is_the_same_however_policies_are_evaluated(patience, monkey
 
 def test_a_policy_that_only_loses_by_chance_is_proved_stabilizing():
     lp = lm.compile(made(killed(1e-5)))
-    found = feasibility._proved(lp, lp.tree[1], np.ones(lp.n), types.never)
+    found = first_policy._proved(lp, lp.tree[1], np.ones(lp.n), types.never)
     assert found is not None

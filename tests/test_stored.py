@@ -13,9 +13,10 @@ from problems import doubling, made, standard_map, steps
 from test_gamma import corner
 
 import lmdsl as lm
-from lmdsl import arrays, folder
 from lmdsl.cli import main
-from lmdsl.stored import NOT_CLAIMED
+from lmdsl.common import arrays
+from lmdsl.results.directory import reading
+from lmdsl.results.directory.audit import NOT_CLAIMED
 from lmdsl.systems import FunctionSystem
 
 ORBIT = [[0.25, 0.5], [0.75, 0.5]]
@@ -57,7 +58,7 @@ def put(target, certificate=None, **contents):
         path = target / f"{name}.npz"
         path.write_bytes(arrays.packed(held))
         stored["files"][path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
-    (target / "certificate.json").write_bytes(folder.text(stored))
+    (target / "certificate.json").write_bytes(reading.text(stored))
 
 
 def refused(target):
@@ -114,7 +115,7 @@ def test_every_field_of_the_certificate(saved):
             for key in path[:-1]:
                 at = at[key]
             at[path[-1]] = other
-            (saved / "certificate.json").write_bytes(folder.text(spoiled))
+            (saved / "certificate.json").write_bytes(reading.text(spoiled))
             tried += 1
             if refused(saved):
                 continue
@@ -123,11 +124,11 @@ def test_every_field_of_the_certificate(saved):
     for key in good:
         if key not in NOT_CLAIMED:
             less = {k: v for k, v in good.items() if k != key}
-            (saved / "certificate.json").write_bytes(folder.text(less))
+            (saved / "certificate.json").write_bytes(reading.text(less))
             # What earlier versions did not say may be missing.
             earlier = ("beyond_gamma", "local_controller", "scope", "coverage", "sure_cells")
             assert refused(saved) or key in earlier, key
-    (saved / "certificate.json").write_bytes(folder.text(good))
+    (saved / "certificate.json").write_bytes(reading.text(good))
     assert lm.verify(saved).holds
     assert tried > 50
 
@@ -201,7 +202,7 @@ def test_the_problem_of_a_function_is_compared(tmp_path, change):
     lm.solve(function()).save(target)
     data = json.loads((target / "problem.json").read_text())
     data = {key: value for key, value in {**data, **change}.items() if value is not None}
-    content = folder.text(data)
+    content = reading.text(data)
     (target / "problem.json").write_bytes(content)
     stored = json.loads((target / "certificate.json").read_text())
     stored["files"]["problem.json"] = hashlib.sha256(content).hexdigest()
@@ -230,7 +231,7 @@ def test_rows_of_a_function_belong_to_one_problem(tmp_path, change, digests):
     stored = json.loads((target / "certificate.json").read_text())
     problem = json.loads((target / "problem.json").read_text())
     for changed, holds in (({**problem, "name": "renamed"}, True), ({**problem, **change}, False)):
-        content = folder.text(changed) if digests else json.dumps(changed).encode()
+        content = reading.text(changed) if digests else json.dumps(changed).encode()
         (target / "problem.json").write_bytes(content)
         if digests:
             stored["files"]["problem.json"] = hashlib.sha256(content).hexdigest()

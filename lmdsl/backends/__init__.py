@@ -19,10 +19,10 @@ from importlib.metadata import (
 )
 from importlib.util import find_spec
 
-from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.errors import BadInput, MissingDependency, plain_text, shown
-from lmdsl.forking import whole
+from lmdsl.machine import quiet
+from lmdsl.machine.forking import whole
 
 BUILT_IN = {
     "policy-iteration": "lmdsl.backends.policy_iteration",

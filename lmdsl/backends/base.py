@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.frozen import Frozen
-from lmdsl.types import Floats
+from lmdsl.common.frozen import Frozen
+from lmdsl.common.types import Floats
 
 if TYPE_CHECKING:
-    from lmdsl.lp import StabilizationLP
+    from lmdsl.model.lp import StabilizationLP
 
 
 class Stop(Enum):

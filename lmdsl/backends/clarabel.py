@@ -16,10 +16,10 @@ import numpy as np
 
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
-from lmdsl.forking import forked
+from lmdsl.machine.forking import forked
 
 if TYPE_CHECKING:
-    from lmdsl.lp import StabilizationLP
+    from lmdsl.model.lp import StabilizationLP
 
 ALGORITHMS = {
     "primal": "faer",

@@ -13,14 +13,14 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING, Any
 
-from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.errors import BadInput, shown
-from lmdsl.forking import forked
+from lmdsl.machine import quiet
+from lmdsl.machine.forking import forked
 
 if TYPE_CHECKING:
-    from lmdsl.lp import StabilizationLP
+    from lmdsl.model.lp import StabilizationLP
 
 PREFERRED = ("HIGHS", "CLARABEL", "SCIPY")
 """The first of these that is installed is the default."""

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lmdsl import quiet
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
 from lmdsl.errors import MissingDependency
+from lmdsl.machine import quiet
 
 if TYPE_CHECKING:
-    from lmdsl.lp import StabilizationLP
+    from lmdsl.model.lp import StabilizationLP
 
 ALGORITHMS = {
     "ipx": {"solver": "ipx", "run_crossover": "off"},

@@ -24,7 +24,7 @@ from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.scaled import ScaledLP, failure
 
 if TYPE_CHECKING:
-    from lmdsl.lp import StabilizationLP
+    from lmdsl.model.lp import StabilizationLP
 
 FIXED = {
     "mehrotra_algorithm": "yes",

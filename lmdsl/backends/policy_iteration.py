@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import time
 
-from lmdsl import feasibility, policy
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
-from lmdsl.deadline import Stopped
-from lmdsl.lp import StabilizationLP
+from lmdsl.machine.deadline import Stopped
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.feasibility import first_policy
+from lmdsl.optimize.policies import policy
 
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:
@@ -25,10 +26,10 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
 
     pair, w = options.start, options.proof
     if pair is None:
-        found = feasibility.stabilizing(lp, late)
-        if isinstance(found, feasibility.Refused):
+        found = first_policy.stabilizing(lp, late)
+        if isinstance(found, first_policy.Refused):
             return Solution(Stop.INFEASIBLE, "infeasible")
-        if isinstance(found, feasibility.Undecided):
+        if isinstance(found, first_policy.Undecided):
             stop = Stop.TIME_LIMIT if late() else Stop.FAILED
             return Solution(stop, stop.name.lower())
         pair, w = found.pair, found.w

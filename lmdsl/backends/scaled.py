@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lmdsl import apart, memory
 from lmdsl.backends.base import Options, Solution, Stop
-from lmdsl.deadline import Deadline, TimeLimitReached
+from lmdsl.common.types import Floats
 from lmdsl.errors import plain_text
-from lmdsl.types import Floats
+from lmdsl.machine import apart, memory
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
 
 if TYPE_CHECKING:
-    from lmdsl.lp import StabilizationLP
+    from lmdsl.model.lp import StabilizationLP
 
 
 ENTRY = 100

@@ -18,8 +18,8 @@ from typing import Any
 from lmdsl.cli import feasibility, listing, results, solving
 from lmdsl.cli.output import Arguments, Run, narrated, print_json
 from lmdsl.cli.streams import kept
-from lmdsl.deadline import TimeLimitReached
 from lmdsl.errors import LmdslError, printable, shown
+from lmdsl.machine.deadline import TimeLimitReached
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -59,7 +59,7 @@ def _fail(message: str, status: int) -> int:
 
 def _bad(parsed: Arguments, message: str, status: str = "bad_input", exit_status: int = 2) -> int:
     if getattr(parsed, "json", False):
-        from lmdsl.result import Report
+        from lmdsl.results.result import Report
 
         report: dict[str, Any] = Report(status=status, message=message).to_dict()
         if parsed.command == "compare":

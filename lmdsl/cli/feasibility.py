@@ -25,8 +25,8 @@ def add(command: Command) -> None:
 
 
 def _gamma_max(parsed: Arguments) -> int:
-    from lmdsl.gamma import gamma_max
-    from lmdsl.problem import load
+    from lmdsl.optimize.feasibility.gamma import gamma_max
+    from lmdsl.problem.problem import load
 
     problem = load(parsed.file)
     with Progress() as progress:
@@ -39,8 +39,8 @@ def _gamma_max(parsed: Arguments) -> int:
 
 
 def _explain(parsed: Arguments) -> int:
-    from lmdsl.explanation import explain
-    from lmdsl.problem import load
+    from lmdsl.explanation.causes import explain
+    from lmdsl.problem.problem import load
 
     problem = load(parsed.file)
     with Progress() as progress:

@@ -21,7 +21,7 @@ def add(command: Command) -> None:
 
 
 def _schema(parsed: Arguments) -> int:
-    from lmdsl.problem import json_schema
+    from lmdsl.problem.problem import json_schema
 
     print_json(json_schema(), indent=2)
     return 0
@@ -45,8 +45,8 @@ def _systems(parsed: Arguments) -> int:
 
 
 def _init(parsed: Arguments) -> int:
-    from lmdsl.files import write_whole
-    from lmdsl.problem import Problem
+    from lmdsl.common.files import write_whole
+    from lmdsl.problem.problem import Problem
     from lmdsl.systems import NAMED
 
     if parsed.name not in NAMED:

@@ -49,7 +49,7 @@ def _time_limit(sub: argparse.ArgumentParser) -> None:
 
 
 def _verify(parsed: Arguments) -> int:
-    from lmdsl.verification import verify
+    from lmdsl.results.verification import verify
 
     with Progress() as progress:
         found = verify(parsed.dir, parsed.exact, progress, parsed.time_limit)
@@ -67,7 +67,7 @@ def _verify(parsed: Arguments) -> int:
 
 
 def _simulate(parsed: Arguments) -> int:
-    from lmdsl.result import Result
+    from lmdsl.results.result import Result
 
     result = Result.load(parsed.dir)
     with Progress() as progress:
@@ -85,7 +85,7 @@ def _simulate(parsed: Arguments) -> int:
 
 def _plot(parsed: Arguments) -> int:
     from lmdsl import plotting
-    from lmdsl.result import Result
+    from lmdsl.results.result import Result
 
     result = Result.load(parsed.dir)
     path = Path(parsed.out) if parsed.out is not None else Path(parsed.dir) / "figures.png"
@@ -95,10 +95,10 @@ def _plot(parsed: Arguments) -> int:
 
 
 def _export(parsed: Arguments) -> int:
-    from lmdsl.exports import export_certificate, export_drn
-    from lmdsl.result import Result
-    from lmdsl.saving import refuse_own_file
-    from lmdsl.verification import recompiled
+    from lmdsl.results.directory.writing import refuse_own_file
+    from lmdsl.results.exports import export_certificate, export_drn
+    from lmdsl.results.result import Result
+    from lmdsl.results.verification import recompiled
 
     refuse_own_file(parsed.out)
     result = Result.load(parsed.dir)

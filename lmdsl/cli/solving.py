@@ -50,7 +50,7 @@ def _problem_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _problem(parsed: Arguments) -> Any:
-    from lmdsl.problem import load
+    from lmdsl.problem.problem import load
 
     problem = load(parsed.file)
     return problem if parsed.gamma is None else problem.replaced(gamma=parsed.gamma)
@@ -58,12 +58,12 @@ def _problem(parsed: Arguments) -> Any:
 
 def _solve(parsed: Arguments) -> int:
     if parsed.out is not None:
-        from lmdsl.saving import refuse_unless_free
+        from lmdsl.results.directory.writing import refuse_unless_free
 
         refuse_unless_free(parsed.out)
         parsed.place = Path(parsed.out).absolute()  # a solver may change the current directory
     problem = _problem(parsed)
-    from lmdsl.stabilize import solve
+    from lmdsl.results.solving import solve
 
     with Progress() as progress:
         result = solve(
@@ -96,7 +96,7 @@ def _solve(parsed: Arguments) -> int:
 
 def _saved(result: Any, parsed: Arguments) -> int:
     """Save a result, elsewhere if it cannot be at its place; return the exit status."""
-    from lmdsl.archive import rescue
+    from lmdsl.results.directory.archive import rescue
 
     try:
         result.save(parsed.place)
@@ -126,7 +126,7 @@ def _simulated(result: Any) -> Any:
 
 def _compare(parsed: Arguments) -> int:
     problem = _problem(parsed)
-    from lmdsl.comparison import compare
+    from lmdsl.results.comparison import compare
 
     names = [name.strip() for name in parsed.backends.split(",") if name.strip()]
     with Progress() as progress:
@@ -183,7 +183,7 @@ def _summary(result: Any) -> str:
 
 
 def _others(result: Any) -> str:
-    from lmdsl.graph import CellStatus
+    from lmdsl.model.stabilizable_set import CellStatus
 
     named = {
         CellStatus.ESCAPES: "escaping",

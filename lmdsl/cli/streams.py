@@ -16,8 +16,8 @@ from collections.abc import Iterator
 from contextvars import ContextVar
 from typing import Any
 
-from lmdsl import quiet
 from lmdsl.errors import printable
+from lmdsl.machine import quiet
 
 _answers: ContextVar[Stream | None] = ContextVar("answers", default=None)
 

@@ -1,4 +1,4 @@
-"""Systems: the generic kinds, and one short file per system known by name."""
+"""Systems x+ = T(x, u, w): the generic kinds, and one short file per system known by name."""
 
 from __future__ import annotations
 

@@ -17,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
-from lmdsl.declared import Declared, Positive, plain
+from lmdsl.common.strict_model import Declared, Positive, plain
+from lmdsl.common.types import Check
 from lmdsl.errors import BadInput, shown
-from lmdsl.forking import cached_property
-from lmdsl.formulas import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, Formula, parse
-from lmdsl.jets import Jet
-from lmdsl.names import Formulas, Parameters
-from lmdsl.program import Program
-from lmdsl.recording import Recorder
-from lmdsl.types import Check
+from lmdsl.formulas.enclosures import Jet
+from lmdsl.formulas.language import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, Formula, parse
+from lmdsl.formulas.names import Formulas, Parameters
+from lmdsl.formulas.program import Program
+from lmdsl.formulas.tracing import Recorder
+from lmdsl.machine.forking import cached_property
 
 Array = NDArray[np.float64]
 Step = Callable[..., tuple[Array, ...]]

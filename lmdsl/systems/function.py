@@ -12,10 +12,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from lmdsl.common.types import Check
 from lmdsl.errors import BadInput, shown
-from lmdsl.surroundings import restore_rounding
+from lmdsl.machine.surroundings import restore_rounding
 from lmdsl.systems.base import Array, Step, System
-from lmdsl.types import Check
 
 WHERE = "system.next"
 ALONE, OF_BLOCK = 8, 2

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import pi
 from typing import ClassVar, Literal
 
-from lmdsl.declared import Positive
+from lmdsl.common.strict_model import Positive
 from lmdsl.systems.base import NamedOde, Substeps
 
 

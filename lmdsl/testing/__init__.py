@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from lmdsl import backends
 from lmdsl.backends import Backend
 from lmdsl.errors import BadInput, MissingDependency, shown
-from lmdsl.surroundings import own_arithmetic
+from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.testing.checks import CHECKS
 from lmdsl.testing.probe import Broken, Probe, Unjudged
 from lmdsl.testing.report import FAILED, PASSED, SKIPPED, Check, ContractFailure, Report

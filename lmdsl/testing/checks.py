@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl import backends, quiet
+from lmdsl import backends
 from lmdsl.backends import Solution, Stop
+from lmdsl.common.types import Floats
 from lmdsl.errors import BadInput, LmdslError
-from lmdsl.lp import StabilizationLP
+from lmdsl.machine import quiet
+from lmdsl.model.lp import StabilizationLP
 from lmdsl.testing import known
 from lmdsl.testing.probe import (
     ACCURACY,
@@ -28,7 +30,6 @@ from lmdsl.testing.probe import (
     misshapen,
     owned,
 )
-from lmdsl.types import Floats
 
 BY_HAND = (
     *(known.single(gamma) for gamma in (0.9, 1.0, 1.5)),

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.forking import cached_property
-from lmdsl.lp import StabilizationLP, compile
-from lmdsl.problem import Problem
-from lmdsl.types import Floats
+from lmdsl.common.types import Floats
+from lmdsl.machine.forking import cached_property
+from lmdsl.model.lp import StabilizationLP, compile
+from lmdsl.problem.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)

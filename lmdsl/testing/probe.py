@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl import quiet
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.scaled import failure
+from lmdsl.common.types import Floats
 from lmdsl.errors import LmdslError, MissingDependency
-from lmdsl.lp import StabilizationLP
+from lmdsl.machine import quiet
+from lmdsl.model.lp import StabilizationLP
 from lmdsl.testing.known import Known
-from lmdsl.types import Floats
 
 ACCURACY = 1e-5
 """Largest relative error of an answer that was asked for without a tolerance."""

@@ -1,0 +1,1 @@
+"""What every room uses and no control engineer needs to know: files, strict models, inputs."""

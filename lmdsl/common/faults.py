@@ -1,0 +1,171 @@
+"""What pydantic finds wrong, as one line: every fault with its path, the value and the fix."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+from types import UnionType
+from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
+
+from pydantic import BaseModel, Tag, ValidationError
+
+from lmdsl.common.files import joined
+from lmdsl.errors import BadInput, shown
+
+MOST_CHARACTERS = 900
+"""Length of a message; what is left out then is counted."""
+
+_FIXES = {
+    "bool_type": "write true or false",
+    "callable_type": "give a function",
+    "dict_type": "write an object in braces",
+    "finite_number": "must be a finite number",
+    "float_type": "write a number",
+    "greater_than": "it must be greater than {gt}",
+    "greater_than_equal": "it must be at least {ge}",
+    "int_type": "write a whole number",
+    "less_than": "it must be less than {lt}",
+    "less_than_equal": "it must be at most {le}",
+    "literal_error": "write {expected}",
+    "model_type": "write an object in braces",
+    "string_too_long": "at most {max_length} characters are allowed",
+    "string_type": "write a string",
+    "too_long": "at most {max_length} entries are allowed",
+    "too_short": "give at least {min_length} of them",
+    "tuple_type": "write a list in brackets",
+}
+"""What to do about each kind of fault that pydantic finds."""
+
+
+_ADD = "required key is missing; add it"
+
+
+class _Fault(NamedTuple):
+    where: str
+    message: str
+    meant: str | None = None
+    """Path of the key that an unknown key was probably meant to be."""
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.message}" if self.where else self.message
+
+
+def condensed(error: ValidationError, model: Any) -> BadInput:
+    """Return all faults of a report as one error; misspelt keys come first.
+
+    Parameters
+    ----------
+    error
+        The report of pydantic.
+    model
+        The model that was validated.
+    """
+    faults = [_fault(item, model) for item in error.errors(include_url=False)]
+    meant = {fault.meant for fault in faults if fault.meant}
+    faults = [fault for fault in faults if fault.where not in meant or not _missing(fault)]
+    first, *others = sorted(faults, key=lambda fault: fault.meant is None)
+    message = first.message
+    for k, fault in enumerate(others):
+        if len(first.where) + len(message) + len(str(fault)) > MOST_CHARACTERS:
+            return BadInput(f"{message}; and {len(others) - k} more", first.where)
+        message += f"; {fault}"
+    return BadInput(message, first.where)
+
+
+def _missing(fault: _Fault) -> bool:
+    return fault.message == _ADD
+
+
+def _fault(item: Mapping[str, Any], model: type[BaseModel]) -> _Fault:
+    location, kind = item["loc"], item["type"]
+    where = _path(location)
+    cause = item.get("ctx", {}).get("error")
+    if isinstance(cause, BadInput):
+        return _Fault(joined(where, cause.where), cause.message)
+    if kind == "missing":
+        return _Fault(where, _ADD)
+    if kind == "extra_forbidden":
+        return _unknown(where, location, model)
+    fix = _FIXES.get(kind)
+    if location[-1:] == ("[key]",):
+        fix = "names are strings"
+    limits = {key: _plain(value) for key, value in item.get("ctx", {}).items()}
+    fix = fix.format(**limits) if fix else item["msg"]
+    given = item["input"]
+    given = list(given) if isinstance(given, tuple) else given
+    return _Fault(where, f"{shown(given)} is not accepted; {fix}")
+
+
+def _plain(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _unknown(where: str, location: tuple[int | str, ...], model: type[BaseModel]) -> _Fault:
+    allowed = sorted({key for kind in _models(model, location[:-1]) for key in kind.model_fields})
+    near = nearest(str(location[-1]), allowed)
+    if near is None:
+        known = f" (known keys: {', '.join(allowed)})" if allowed else ""
+        return _Fault(where, f"unknown key; remove it or correct its spelling{known}")
+    return _Fault(where, f"unknown key; did you mean {near!r}?", _path((*location[:-1], near)))
+
+
+def nearest(name: str, known: Any) -> str | None:
+    """Return the known name that a name was probably meant to be, if any."""
+    folded = {key.replace("_", "").lower(): key for key in known}
+    found = difflib.get_close_matches(name[:100].replace("_", "").lower(), folded, 1, 0.75)
+    return folded[found[0]] if found else None
+
+
+def _models(model: type[BaseModel], location: tuple[int | str, ...]) -> list[type[BaseModel]]:
+    """Return the models that may stand at a location of a report."""
+    types: list[Any] = [model]
+    for part in location:
+        types = [inner for outer in types for inner in _inside(outer, part)]
+    return [kind for outer in types for kind in _members(outer) if _is_model(kind)]
+
+
+def _inside(kind: Any, part: int | str) -> Iterator[Any]:
+    """Yield the types one step further; a tag in angle brackets chooses of a union."""
+    if isinstance(part, str) and part.startswith("<"):
+        for member in _members(kind):
+            if part in [extra.tag for extra in _extras(member) if isinstance(extra, Tag)]:
+                yield member
+        return
+    for member in _members(kind):
+        bare = _bare(member)
+        if _is_model(bare) and part in bare.model_fields:
+            yield bare.model_fields[part].annotation
+        elif get_origin(bare) is dict:
+            yield get_args(bare)[1]
+        elif get_origin(bare) is tuple:
+            yield get_args(bare)[0]
+
+
+def _members(kind: Any) -> list[Any]:
+    bare = _bare(kind)
+    if get_origin(bare) in (Union, UnionType):
+        return [inner for member in get_args(bare) for inner in (member, *_members(member)[1:])]
+    return [kind]
+
+
+def _bare(kind: Any) -> Any:
+    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
+
+
+def _extras(kind: Any) -> tuple[Any, ...]:
+    return get_args(kind)[1:] if get_origin(kind) is Annotated else ()
+
+
+def _is_model(kind: Any) -> bool:
+    kind = _bare(kind)
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _path(location: tuple[int | str, ...]) -> str:
+    # Parts in angle brackets are tags of unions, "[key]" says that a key is at fault: no keys.
+    keys = (k for k in location if not (isinstance(k, str) and (k[:1] == "<" or k == "[key]")))
+    return joined(*(f"[{k}]" if isinstance(k, int) else _key(k) for k in keys))
+
+
+def _key(key: str) -> str:
+    return key if key.isascii() and key.isidentifier() and len(key) <= 64 else shown(key)

@@ -1,0 +1,295 @@
+"""Whether the local controller keeps the attractor cells: by samples, and by enclosure.
+
+To prove T(x, C0(x), w) in A for every x of a cell, its domain (every state that is located in it)
+is cut into boxes until the enclosed image of each (jets.py) meets attractor cells only. This is
+proved of the map as computed, with its rounding, and so of what a simulation can do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Check, Floats, Indices
+from lmdsl.formulas.enclosures import Jet, apply, enclosure
+from lmdsl.formulas.intervals import Interval, subtract
+from lmdsl.formulas.program import FUNCTION
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
+from lmdsl.model.discretization import noise_nodes
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local_controller import LocalController
+from lmdsl.problem.problem import Problem
+
+SAMPLES, FEWEST = 10_000, 10
+SAMPLED_WORK = 1e10  # additions that take as long as all samples: some seconds
+CHUNK = 8192  # cells enclosed at a time
+WORK = 2e7  # most operations on boxes that an enclosure may take: some seconds
+OVERHEAD = 1000  # boxes whose arithmetic costs as much as NumPy's own work for an operation
+ROUNDS = 14  # most halvings of an axis
+MEETS = 512  # most cells that the image of a box may meet
+DOING = "checking the local controller"
+
+
+@dataclass(frozen=True)
+class LocalCheck:
+    """Whether the local controller keeps the attractor cells: T(x, C0(x), w) in A for x in A.
+
+    Attributes
+    ----------
+    kind
+        ``constant``, ``linear`` or ``lqr``.
+    multiplier
+        Largest modulus of the multipliers of the linearised orbit; below 1 it attracts.
+    cells
+        Number of attractor cells.
+    proved
+        Of these, cells whose every point is mapped into A: enclosed by interval arithmetic. None
+        for a system written in Python, which cannot be enclosed.
+    samples, kept
+        Random states of A, and how many of them are mapped into A by every noise node. Fewer where
+        there are many nodes or operations, or no more time.
+    """
+
+    kind: str
+    multiplier: float | None
+    cells: int
+    proved: int | None
+    samples: int
+    kept: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        return asdict(self)
+
+    def sentence(self) -> str:
+        """Return one line for people."""
+        line = f"{self.kind}: "
+        if self.proved is not None:
+            known = f"{self.proved} of {self.cells} attractor cells are"
+            line += known if self.proved else "no attractor cell is"
+            line += " proved to be kept (by the map as computed); "
+        line += f"{self.kept} of {self.samples} random states of A were kept"
+        if self.multiplier is not None:
+            line += f"; orbit's multiplier {self.multiplier:.4g}"
+        return line
+
+
+def check(
+    problem: Problem,
+    local: LocalController,
+    deadline: Deadline | None = None,
+    samples: int | None = None,
+) -> LocalCheck:
+    """Check whether the local controller of a problem keeps the attractor cells.
+
+    Parameters
+    ----------
+    problem, local
+        The problem and its local controller.
+    deadline
+        Ends the work with what is known.
+    samples
+        How many random states to try; by default as many as take some seconds.
+    """
+    cells = np.flatnonzero(local.attractor)
+    asked, nodes = Deadline.of(deadline), noise_nodes(problem).values
+    if samples is None:
+        work = getattr(problem.step(), "work", FUNCTION) * len(nodes)
+        samples = int(min(SAMPLES, max(SAMPLED_WORK // work, FEWEST)))
+    proved = _proved(problem, local, cells, nodes, asked)
+    samples, kept = _sampled(problem, local, cells, nodes, samples, asked)
+    return LocalCheck(
+        kind="constant" if problem.local_controller is None else problem.local_controller.kind,
+        multiplier=local.multiplier,
+        cells=len(cells),
+        proved=proved,
+        samples=samples,
+        kept=kept,
+    )
+
+
+def _sampled(
+    problem: Problem,
+    local: LocalController,
+    cells: Indices,
+    nodes: Floats,
+    count: int,
+    deadline: Deadline,
+) -> tuple[int, int]:
+    """Return how many states were tried in time, and how many of them stay."""
+    rng = np.random.default_rng(0)
+    cell = cells[rng.integers(len(cells), size=count)]
+    partition = local.partition
+    index = np.stack(partition.multi_index(cell), axis=-1)
+    x = partition.low + (index + rng.random(index.shape)) * partition.width
+    kept, part = 0, max(FEWEST, CHUNK // len(nodes))
+    for start in range(0, count, part):
+        some = slice(start, min(start + part, count))
+        try:
+            kept += int(_stays(problem, local, x[some], cell[some], nodes, deadline).sum())
+        except TimeLimitReached:
+            return start, kept
+    return count, kept
+
+
+def _stays(
+    problem: Problem,
+    local: LocalController,
+    x: Floats,
+    cell: Indices,
+    nodes: Floats,
+    deadline: Deadline,
+) -> NDArray[np.bool_]:
+    """Return which states of attractor cells are mapped into A by every noise node."""
+    u = local(x, cell)
+    values = {name: x[:, k, None] for k, name in enumerate(problem.states)}
+    values |= {name: u[:, k, None] for k, name in enumerate(problem.controls)}
+    step, stays = problem.step(), np.ones(len(x), dtype=np.bool_)
+    width = max(1, CHUNK // max(len(x), 1))
+    for start in range(0, len(nodes), width):
+        some = nodes[start : start + width]
+        noise = {name: some[None, :, j] for j, name in enumerate(problem.noises)}
+        shape = len(x), len(some)
+        images = step({**values, **noise}, partial(deadline.check, DOING))
+        target = local.partition.locate([np.broadcast_to(y, shape) for y in images])
+        stays &= ((target >= 0) & local.attractor[target]).all(axis=1)
+    return stays
+
+
+def _proved(
+    problem: Problem, local: LocalController, cells: Indices, nodes: Floats, deadline: Deadline
+) -> int | None:
+    """Count the cells that are mapped into A as a whole; None where no formula allows it.
+
+    Cells that are still undecided when the work is used up count as not proved.
+    """
+    step = problem.step()
+    if not hasattr(step, "enclose"):
+        return None
+    per_box = float(step.effort) * len(nodes) * (1 + local.partition.dimension)
+    proved, work = 0, WORK
+    for start in range(0, len(cells), CHUNK):
+        some = cells[start : start + CHUNK]
+        try:
+            kept, spent = _kept(problem, local, some, nodes, work / per_box, deadline)
+        except TimeLimitReached:
+            break
+        proved += kept
+        work -= spent * per_box
+        if work <= 0:
+            break
+    return proved
+
+
+def _kept(
+    problem: Problem,
+    local: LocalController,
+    cells: Indices,
+    nodes: Floats,
+    limit: float,
+    deadline: Deadline,
+) -> tuple[int, float]:
+    """Return how many of some cells are proved, and the work in boxes.
+
+    A box whose image is not enclosed in A is halved along its longest side (in cell widths),
+    unless its centre is mapped outside: then its cell is lost.
+    """
+    step, partition, check = problem.step(), local.partition, partial(deadline.check, DOING)
+    (low, high, home), work = partition.domain(cells), 0.0
+    lost = np.zeros(len(cells), dtype=np.bool_)
+    for _ in range(ROUNDS * partition.dimension):
+        work += len(home) + OVERHEAD
+        if not len(home) or work > limit:
+            break
+        inside = np.ones(len(home), dtype=np.bool_)
+        with np.errstate(all="ignore"):
+            for node in nodes:
+                check()
+                images = _images(problem, local, step, cells[home], low, high, node, check)
+                inside &= _into(partition, local.attractor, images)
+        centre = low / 2 + high / 2
+        lost[home[~_stays(problem, local, centre, cells[home], nodes, deadline)]] = True
+        open_ = ~inside & ~lost[home]
+        low, high, home = low[open_], high[open_], home[open_]
+        axis = np.argmax((high - low) / partition.width, axis=1)
+        rows = np.arange(len(home))
+        upper, lower = low.copy(), high.copy()
+        upper[rows, axis] = lower[rows, axis] = (low[rows, axis] + high[rows, axis]) / 2
+        low, high = np.concatenate([low, upper]), np.concatenate([lower, high])
+        home = np.concatenate([home, home])
+    lost[home] = True
+    return int((~lost).sum()), work
+
+
+def _images(
+    problem: Problem,
+    local: LocalController,
+    step: Any,
+    cell: Indices,
+    low: Floats,
+    high: Floats,
+    noise: Floats,
+    check: Check,
+) -> list[Interval]:
+    """Enclose T(x, C0(x), w) on boxes."""
+    centre = Interval.point(low / 2 + high / 2)
+    away = subtract(Interval(low, high), centre)
+    steps = [Interval(*(end[:, k] for end in away)) for k in range(local.partition.dimension)]
+    images = _closed(problem, local, step, cell, Interval(low, high), noise, check)
+    middle = _closed(problem, local, step, cell, centre, noise, check)
+    return [enclosure(image, at, steps) for image, at in zip(images, middle, strict=True)]
+
+
+def _closed(
+    problem: Problem,
+    local: LocalController,
+    step: Any,
+    cell: Indices,
+    box: Interval,
+    noise: Floats,
+    check: Check,
+) -> tuple[Jet, ...]:
+    """Return jets of the closed loop, derivatives with respect to the states."""
+    d = local.partition.dimension
+    x = [Jet.variable(Interval(box.low[:, i], box.high[:, i]), i, d) for i in range(d)]
+
+    def on_jets(operation: str, *operands: Any) -> Any:
+        return apply(operation, [y if isinstance(y, Jet) else Jet.constant(y, d) for y in operands])
+
+    u = local.law(x, cell, on_jets)
+    values = dict(zip((*problem.states, *problem.controls), (*x, *u), strict=True))
+    for j, name in enumerate(problem.noises):
+        values[name] = Jet.constant(noise[j], d)
+    images: tuple[Jet, ...] = step.enclose(values, check)
+    return images
+
+
+def _into(
+    partition: Partition, attractor: NDArray[np.bool_], images: list[Interval]
+) -> NDArray[np.bool_]:
+    """Return which image boxes lie in the attractor: every cell that they may meet is one.
+
+    These are the cells between those of the ends, since locating is monotone (axis.py).
+    """
+    count = np.broadcast_shapes(*(np.shape(end) for image in images for end in image))[0]
+    sure = np.ones(count, dtype=np.bool_)
+    first = np.zeros((len(images), count), dtype=np.int64)
+    size = np.ones((len(images), count), dtype=np.int64)
+    for k, (image, axis) in enumerate(zip(images, partition.axes, strict=True)):
+        ends = [axis.number(np.broadcast_to(end, count), partition.clip) for end in image]
+        meets = ends[1] - ends[0] + 1
+        sure &= meets <= MEETS  # NaN where an end is out
+        first[k], size[k] = np.where(sure, ends[0], 0), np.where(sure, meets, 1)
+    cells = np.prod(size.astype(np.float64), axis=0)
+    sure &= cells <= MEETS
+    for number in range(int(cells[sure].max(initial=0))):
+        rest, cell = np.full(count, number), np.zeros(count, dtype=np.int64)
+        for k in range(len(images)):  # the number-th cell of each image; beyond its last, repeats
+            rest, step = np.divmod(rest, size[k])
+            cell = cell * int(partition.cells[k]) + (first[k] + step) % int(partition.cells[k])
+        sure &= attractor[cell]
+    return sure

@@ -1,1 +1,0 @@
-"""What plots are made of: views of the cells, runs of the system, and layers of ink."""

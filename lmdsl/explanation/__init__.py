@@ -1,0 +1,1 @@
+"""Why cells cannot be stabilized, and what would help."""

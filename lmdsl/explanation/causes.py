@@ -1,0 +1,309 @@
+"""Infeasibility explained: by cause and region, cell by cell, in mass, and what would help."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common import inputs
+from lmdsl.common.frozen import Frozen
+from lmdsl.common.types import Progress
+from lmdsl.errors import BadInput, shown
+from lmdsl.explanation import one_cell
+from lmdsl.explanation.hints import Hint, hints
+from lmdsl.explanation.lost_mass import PhaseOne
+from lmdsl.explanation.one_cell import NAMES, Why
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
+from lmdsl.machine.forking import cached_property
+from lmdsl.machine.surroundings import own_arithmetic
+from lmdsl.model import stabilizable_set
+from lmdsl.model.assembly.sampler import Sampler
+from lmdsl.model.assembly.transitions import Transitions, assemble
+from lmdsl.model.grid import boxes
+from lmdsl.model.grid.boxes import Region
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.problem.problem import Problem
+
+LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
+MEANING = {
+    CellStatus.ESCAPES: "every control sends some sample out of the box, into avoid, or to "
+    "a value that is not finite",
+    CellStatus.TRAPPED: "A cannot be reached through admissible pairs",
+    CellStatus.LEADS_TO_THESE: "A can be reached, but not without the risk of a cell that is lost",
+}
+
+
+@dataclass(frozen=True)
+class Cause:
+    """The cells that one cause keeps outside C.
+
+    Attributes
+    ----------
+    name
+        ``escapes``, ``trapped`` or ``leads to these``.
+    cells
+        How many there are.
+    regions
+        Disjoint boxes of such cells only, largest first.
+    elsewhere
+        Number of the cells in none of these boxes.
+    """
+
+    name: str
+    cells: int
+    regions: tuple[Region, ...]
+    elsewhere: int
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Explanation(Frozen):
+    """Why cells lie outside the stabilizable set C.
+
+    Attributes
+    ----------
+    problem, partition
+        What was explained, and the geometry of its cells.
+    cell_status
+        Codes of :class:`lmdsl.model.stabilizable_set.CellStatus`, shape (N,).
+    causes
+        One entry for each cause that occurs.
+    hints
+        What trials with the true map show would help.
+    phase_one
+        The phase-one LP, None where it was not asked for.
+    assembled
+        The transitions of all admissible pairs, if they are at hand.
+    """
+
+    problem: Problem
+    partition: Partition
+    cell_status: NDArray[np.uint8]
+    causes: tuple[Cause, ...]
+    hints: tuple[Hint, ...]
+    phase_one: PhaseOne | None = None
+    assembled: Transitions | None = field(default=None, compare=False)
+
+    @property
+    def lost(self) -> int:
+        """Number of cells outside C, A and avoid."""
+        return sum(cause.cells for cause in self.causes)
+
+    @cached_property
+    def transitions(self) -> Transitions:
+        """The transitions of all admissible pairs."""
+        return self.assembled or assemble(self.problem, self.partition)
+
+    @cached_property
+    def sampler(self) -> Sampler:
+        """The map at the samples of cells."""
+        return Sampler(self.problem, self.partition)
+
+    def why(self, cell: int | Mapping[str, float]) -> Why:
+        """Return the cause of a cell and its blocking facts.
+
+        Parameters
+        ----------
+        cell
+            The index of a cell in the box, or a state by name.
+
+        Raises
+        ------
+        BadInput
+            There is no such cell.
+        """
+        i = self._cell(cell)
+        status = CellStatus(self.cell_status[i])
+        p = self.partition
+        index = tuple(int(k) for k in np.unravel_index(i, p.shape))
+        known: dict[str, Any] = {
+            "cell": i, "index": index, "box": boxes.of_cell(p, i), "cause": NAMES[status],
+            "controls": len(self.sampler.controls),
+        }  # fmt: skip
+        if status in (CellStatus.ESCAPES, CellStatus.LEADS_TO_THESE):
+            return Why(moves=one_cell.moves(self.sampler, self.cell_status, i), **known)
+        if status != CellStatus.TRAPPED:
+            return Why(**known)
+        free = self.transitions.regions.free
+        start = int(np.searchsorted(free, i))
+        pair_pointer, rows = self.transitions.pair_pointer, self.transitions.rows
+        reached = free[one_cell.reachable(pair_pointer, rows, start)]
+        mask = np.zeros(p.size, dtype=np.bool_)
+        mask[reached] = True
+        return Why(
+            trap=boxes.regions(p, mask, one_cell.MOST_BOXES),
+            trap_cells=len(reached),
+            trap_lost=int((self.cell_status[reached] == CellStatus.ESCAPES).sum()),
+            **known,
+        )
+
+    def _cell(self, cell: int | Mapping[str, float]) -> int:
+        p = self.partition
+        if isinstance(cell, Mapping):
+            if set(cell) != set(p.names):
+                raise BadInput(f"a state names every axis once: {', '.join(p.names)}", "cell")
+            (i,) = p.locate([np.array([float(cell[name])]) for name in p.names], clip=False)
+            if i < 0:
+                raise BadInput(f"{shown(dict(cell))} lies outside the state box", "cell")
+            return int(i)
+        if (
+            isinstance(cell, bool)
+            or not isinstance(cell, int | np.integer)
+            or not (0 <= cell < p.size)
+        ):
+            raise BadInput(f"{shown(cell)} is not a cell; cells are 0..{p.size - 1}", "cell")
+        return int(cell)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return strict JSON data; each region has the first blocking fact of its middle cell."""
+        causes = {}
+        for cause in self.causes:
+            listed = [
+                {**region.to_dict(), "cell": region.cell, "why": self.why(region.cell).first}
+                for region in cause.regions
+            ]
+            causes[cause.name] = {
+                "cells": cause.cells, "regions": listed, "elsewhere": cause.elsewhere
+            }  # fmt: skip
+        return {
+            "cells": self.partition.size,
+            "stabilizable_cells": int((self.cell_status == CellStatus.STABILIZED).sum()),
+            "lost_cells": self.lost,
+            "causes": causes,
+            "hints": [hint.to_dict() for hint in self.hints],
+            "phase_one": self.phase_one and self.phase_one.to_dict(),
+        }
+
+    def text(self) -> str:
+        """Return the explanation for people."""
+        stabilizable = int((self.cell_status == CellStatus.STABILIZED).sum())
+        lines = [f"{self.lost} of {self.lost + stabilizable} cells outside A and avoid cannot be "
+                 "stabilized"]  # fmt: skip
+        meaning = {NAMES[status]: text for status, text in MEANING.items()}
+        for cause in self.causes:
+            lines += ["", f"{cause.name}, {cause.cells} cells: {meaning[cause.name]}"]
+            for region in cause.regions:
+                lines.append(f"  {region.cells} in {region}")
+                lines.append(f"    {self.why(region.cell).first}")
+            if cause.elsewhere:
+                lines.append(f"  {cause.elsewhere} elsewhere")
+        if self.lost:
+            lines += ["", "what would help, as far as trials with the true map show:"]
+            lines += [f"  {hint.text}" for hint in self.hints] or ["  nothing that was tried"]
+        if self.phase_one:
+            lines += ["", self.phase_one.text()]
+        return "\n".join(lines)
+
+    __str__ = text
+
+    def __repr__(self) -> str:
+        parts = [f"{cause.cells} {cause.name}" for cause in self.causes]
+        return f"Explanation({', '.join(parts) or 'every cell is stabilizable'})"
+
+
+@own_arithmetic
+def explain(
+    problem: Problem | StabilizationLP,
+    *,
+    regions: int = 8,
+    phase_one: bool = False,
+    time_limit: float | Deadline | None = None,
+    progress: Progress | None = None,
+) -> Explanation:
+    """Explain which cells cannot be stabilized, why, and what would help.
+
+    Parameters
+    ----------
+    problem
+        A problem, or its compiled LP. Its gamma plays no part, but in the phase-one LP.
+    regions
+        Largest number of boxes for each cause.
+    phase_one
+        Solve the phase-one LP: how much mass of which cells cannot be stabilized.
+    time_limit
+        Seconds. Hints that were not tried by then are left out.
+    progress
+        Called with (stage, fraction done, or -1) during long work.
+
+    Raises
+    ------
+    BadInput
+        The problem cannot be compiled, or ``regions`` is not positive.
+    TimeLimitReached
+        The problem was not compiled, or the phase-one LP not solved, in time.
+    LmdslError
+        The phase-one LP is not solved.
+    """
+    inputs.kind(problem, (Problem, StabilizationLP), "problem", "a Problem or a compiled LP")
+    deadline = Deadline.of(time_limit)
+    regions, phase_one = inputs.whole(regions, "regions"), inputs.flag(phase_one, "phase_one")
+    assembled = None
+    if isinstance(problem, StabilizationLP):
+        partition, status = problem.partition, problem.cell_status.copy()
+        status[status == CellStatus.BEYOND_GAMMA] = CellStatus.STABILIZED
+        status.setflags(write=False)
+        problem = problem.problem
+    else:
+        partition = Partition.of(problem)
+        assembled = assemble(problem, partition, progress, deadline)
+        status = _status(partition, assembled, deadline)
+    if phase_one and assembled is None:
+        assembled = assemble(problem, partition, progress, deadline)
+    if progress:
+        progress("explain", -1.0)
+    found = []
+    for code in LOST:
+        mask = status == code
+        if mask.any():
+            parts = boxes.regions(partition, mask, regions)
+            cells = int(mask.sum())
+            inside = sum(part.cells for part in parts)
+            found.append(Cause(NAMES[code], cells, parts, cells - inside))
+    solved = None
+    if phase_one and assembled is not None:
+        solved = PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
+    helpful: tuple[Hint, ...] = ()
+    with suppress(TimeLimitReached):
+        helpful = hints(Sampler(problem, partition, deadline, "trying what helps"), status)
+    return Explanation(problem, partition, status, tuple(found), helpful, solved, assembled)
+
+
+def phase_one(problem: Problem, time_limit: float | Deadline | None = None) -> PhaseOne:
+    """Solve the phase-one LP of a problem; see :mod:`lmdsl.explanation.lost_mass` for what it says.
+
+    Parameters
+    ----------
+    problem
+        A problem.
+    time_limit
+        Seconds.
+
+    Raises
+    ------
+    TimeLimitReached
+        The time limit was reached.
+    LmdslError
+        The LP is not solved.
+    """
+    partition, deadline = Partition.of(problem), Deadline.of(time_limit)
+    assembled = assemble(problem, partition, deadline=deadline)
+    status = _status(partition, assembled, deadline)
+    return PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
+
+
+def _status(
+    partition: Partition, transitions: Transitions, deadline: Deadline
+) -> NDArray[np.uint8]:
+    """Return the status of every cell, shape (N,)."""
+    found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
+    status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)
+    status[transitions.regions.free] = stabilizable_set.causes(found, transitions.pair_pointer)
+    status[transitions.regions.attractor] = CellStatus.ATTRACTOR
+    status.setflags(write=False)
+    return status

@@ -1,8 +1,0 @@
-"""Files for readers that are not lmdsl: a certificate to be checked alone, and Storm's format."""
-
-from __future__ import annotations
-
-from lmdsl.exports.certificate import export_certificate
-from lmdsl.exports.drn import export_drn
-
-__all__ = ["export_certificate", "export_drn"]

@@ -1,0 +1,1 @@
+"""Text formulas: read, evaluated, enclosed, traced."""

@@ -1,0 +1,221 @@
+"""Interval arithmetic on arrays: every operation encloses what its operands can produce.
+
+That is both the real results and the doubles computed. Sums, products and quotients of doubles are
+correctly rounded, so a unit in the last place makes a bound safe; an elementary function is trusted
+to FUNCTION_ULPS of them (NumPy documents less than 4), once at the end of the interval and once at
+the value. An operation that may be undefined somewhere on its operands (a logarithm of a negative
+number, a quotient across zero) returns the whole line: nothing is then claimed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from lmdsl.common.types import Floats
+
+ROUNDING: Final = 2.0**-53
+"""Relative error of a correctly rounded operation."""
+
+FUNCTION_ULPS: Final = 4
+"""Error of a computed elementary function, in units of the last place of its value."""
+
+TINY: Final = 2.0**-1070
+"""More than a few operations lose to underflow."""
+
+_FUNCTION: Final = (4 * FUNCTION_ULPS + 2) * ROUNDING  # a unit is at most 2 ROUNDING of the value
+_TOP: Final = 1.0 + _FUNCTION  # so far a computed sine may go
+_LARGE: Final = 1e8  # beyond it, where in its period an argument lies is not worth finding out
+
+
+class Interval(NamedTuple):
+    """Arrays of lower and upper ends; they broadcast like numbers."""
+
+    low: Any
+    high: Any
+
+    @staticmethod
+    def point(x: Any) -> Interval:
+        """Return the degenerate interval of exact numbers."""
+        array = np.asarray(x, dtype=np.float64)
+        return Interval(array, array)
+
+    @property
+    def midpoint(self) -> Floats:
+        """A point inside."""
+        return np.asarray(np.clip(self.low / 2 + self.high / 2, self.low, self.high))
+
+
+def whole(like: Any) -> Interval:
+    """Return the whole line, in the shape of an array."""
+    return Interval(np.full(np.shape(like), -np.inf), np.full(np.shape(like), np.inf))
+
+
+def outward(low: Any, high: Any) -> Interval:
+    """Widen by a unit in the last place or two; what is not a number becomes the line."""
+    return _widened(low, high, 2 * ROUNDING, 5e-324)
+
+
+def loosened(low: Any, high: Any) -> Interval:
+    """Widen the computed values of an elementary function; see the module."""
+    return _widened(low, high, _FUNCTION, TINY)
+
+
+def _widened(low: Any, high: Any, share: float, least: float) -> Interval:
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    low, high = low - (np.abs(low) * share + least), high + (np.abs(high) * share + least)
+    return Interval(np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high))
+
+
+def magnitude(a: Interval) -> Any:
+    """Return the largest |x| of an interval."""
+    return np.maximum(np.abs(a.low), np.abs(a.high))
+
+
+def mignitude(a: Interval) -> Any:
+    """Return the least |x| of an interval."""
+    across = (a.low <= 0) & (a.high >= 0)
+    return np.where(across, 0.0, np.minimum(np.abs(a.low), np.abs(a.high)))
+
+
+def either(condition: Any, a: Interval, b: Interval) -> Interval:
+    """Return a where the condition holds, else b."""
+    return Interval(np.where(condition, a.low, b.low), np.where(condition, a.high, b.high))
+
+
+def hull(a: Interval, b: Interval) -> Interval:
+    """Return the smallest interval that holds both."""
+    return Interval(np.minimum(a.low, b.low), np.maximum(a.high, b.high))
+
+
+def intersection(a: Interval, b: Interval) -> Interval:
+    """Return what two enclosures of the same number have in common."""
+    return Interval(np.maximum(a.low, b.low), np.minimum(a.high, b.high))
+
+
+def add(a: Interval, b: Interval) -> Interval:
+    """Return a + b."""
+    return outward(a.low + b.low, a.high + b.high)
+
+
+def subtract(a: Interval, b: Interval) -> Interval:
+    """Return a - b."""
+    return outward(a.low - b.high, a.high - b.low)
+
+
+def negative(a: Interval) -> Interval:
+    """Return -a."""
+    return Interval(-a.high, -a.low)
+
+
+def multiply(a: Interval, b: Interval) -> Interval:
+    """Return a b, with 0 times infinity = 0: an end at infinity is a bound, not a value."""
+    left, right = (x[:1] if x.low is x.high else x for x in (a, b))  # points have one end
+    products = [np.asarray(x * y) for x in left for y in right]
+    if any(np.isnan(p).any() for p in products):
+        products = [np.where(np.isnan(p), 0.0, p) for p in products]
+    low, high = products[0], products[0]
+    for p in products[1:]:
+        low, high = np.minimum(low, p), np.maximum(high, p)
+    return outward(low, high)
+
+
+def square(a: Interval) -> Interval:
+    """Return a^2, which is never negative."""
+    return even(a, np.square, outward)
+
+
+def even(a: Interval, function: Callable[[Any], Any], widen: Callable[..., Interval]) -> Interval:
+    """Return f(a) of an even function that grows with |a| from f(0) >= 0."""
+    near, far = function(mignitude(a)), function(magnitude(a))
+    value = widen(near, far)
+    return Interval(np.maximum(value.low, 0.0), value.high)
+
+
+def divide(a: Interval, b: Interval) -> Interval:
+    """Return a / b; the whole line where b may be zero."""
+    inverse = outward(1.0 / b.high, 1.0 / b.low)
+    zero = (b.low <= 0) & (b.high >= 0)
+    quotient = multiply(a, either(zero, Interval.point(1.0), inverse))
+    return either(zero, whole(quotient.low), quotient)
+
+
+def increasing(
+    function: Callable[[Any], Any], low: float = -math.inf, high: float = math.inf
+) -> Callable[[Interval], Interval]:
+    """Return the extension of an increasing function that is defined on [low, high]."""
+
+    def extension(a: Interval) -> Interval:
+        inside = (a.low >= low) & (a.high <= high)
+        value = loosened(function(a.low), function(a.high))
+        return either(inside, value, whole(value.low))
+
+    return extension
+
+
+def exactly(function: Callable[[Any], Any]) -> Callable[[Interval], Interval]:
+    """Return the extension of an increasing step function, which needs no widening."""
+    return lambda a: Interval(np.asarray(function(a.low)), np.asarray(function(a.high)))
+
+
+def _turns(a: Interval, offset: float, period: float) -> Any:
+    """Return whether an interval may hold offset + k period for a whole k; errs towards yes."""
+    slack = 1e-12 * (1 + magnitude(a))
+    first, last = (a.low - slack - offset) / period, (a.high + slack - offset) / period
+    far = ~(magnitude(a) <= _LARGE)
+    return (np.floor(last) >= np.ceil(first)) | far
+
+
+def sine(a: Interval) -> Interval:
+    """Return sin(a)."""
+    return _wave(a, np.sin, math.pi / 2)
+
+
+def cosine(a: Interval) -> Interval:
+    """Return cos(a)."""
+    return _wave(a, np.cos, 0.0)
+
+
+def _wave(a: Interval, function: Callable[[Any], Any], top: float) -> Interval:
+    ends = function(a.low), function(a.high)
+    value = loosened(np.minimum(*ends), np.maximum(*ends))
+    low = np.where(_turns(a, top - math.pi, 2 * math.pi), -_TOP, value.low)
+    high = np.where(_turns(a, top, 2 * math.pi), _TOP, value.high)
+    return Interval(np.maximum(low, -_TOP), np.minimum(high, _TOP))
+
+
+def tangent(a: Interval) -> Interval:
+    """Return tan(a); the whole line where a pole may lie inside."""
+    value = loosened(np.tan(a.low), np.tan(a.high))
+    return either(_turns(a, math.pi / 2, math.pi), whole(value.low), value)
+
+
+def absolute(a: Interval) -> Interval:
+    """Return |a|."""
+    return Interval(mignitude(a), magnitude(a))
+
+
+def power(a: Interval, exponent: float) -> Interval:
+    """Return a ** exponent for a constant exponent."""
+    whole_number = float(exponent).is_integer()
+    if exponent < 0:
+        return divide(Interval.point(1.0), power(a, -exponent))
+    if whole_number and exponent % 2 == 0:
+        return even(a, lambda x: np.power(x, exponent), loosened)
+    value = loosened(np.power(a.low, exponent), np.power(a.high, exponent))
+    return value if whole_number else either(a.low >= 0, value, whole(value.low))
+
+
+def angle(y: Interval, x: Interval) -> Interval:
+    """Return atan2(y, x): extreme at corners unless the box meets the cut or the origin."""
+    corners = [np.arctan2(v, u) for v in y for u in x]
+    low, high = corners[0], corners[0]
+    for c in corners[1:]:
+        low, high = np.minimum(low, c), np.maximum(high, c)
+    cut = (x.low <= 0) & (y.low <= 0) & (y.high >= 0)
+    value = loosened(low, high)
+    turn = loosened(np.full(np.shape(low), -math.pi), np.full(np.shape(low), math.pi))
+    return either(cut, turn, value)

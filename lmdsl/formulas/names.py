@@ -1,0 +1,48 @@
+"""Names and formulas as declared keys: what a state, control, noise or parameter may be called."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field
+
+from lmdsl.common.strict_model import Number, SchemaWords, frozen_dict, plain
+from lmdsl.formulas.language import MAX_CHARACTERS, MAX_NAME, RESERVED, check_name
+
+
+def _named(value: dict[str, Any]) -> dict[str, Any]:
+    for name in value:
+        check_name(name)
+    return value
+
+
+FormulaText = Annotated[str, SchemaWords({"minLength": 1, "maxLength": MAX_CHARACTERS})]
+"""A text formula; the model that knows its names parses it."""
+
+valid_names = AfterValidator(_named)
+
+named_keys = SchemaWords(
+    {
+        "propertyNames": {
+            "pattern": "^[A-Za-z_][A-Za-z0-9_]*$",
+            "maxLength": MAX_NAME,
+            "not": {"enum": sorted(RESERVED)},
+        }
+    }
+)
+"""What `valid_names` asks for, in words of JSON Schema."""
+
+Parameters = Annotated[
+    dict[str, Number],
+    Field(max_length=1000),
+    BeforeValidator(plain),
+    valid_names,
+    named_keys,
+    frozen_dict,
+]
+"""Named constants of a system."""
+
+Formulas = Annotated[
+    dict[str, FormulaText], BeforeValidator(plain), valid_names, named_keys, frozen_dict
+]
+"""One formula per state."""

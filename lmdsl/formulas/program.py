@@ -1,0 +1,217 @@
+"""Evaluating formulas: several compiled together into one flat list of array operations."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Check
+from lmdsl.errors import BadInput
+from lmdsl.formulas.enclosures import Jet, apply
+from lmdsl.formulas.language import OPERATIONS, PLAIN, Formula, Step, fold
+
+
+class Instruction(NamedTuple):
+    """An operation on slots; ``released`` are those that nothing reads any more."""
+
+    operation: str
+    operands: tuple[int, ...]
+    target: int
+    released: tuple[int, ...] = ()
+    reusable: tuple[int, ...] = ()  # those of them that may hold the result
+
+
+class Program:
+    """Several formulas compiled together, each distinct step evaluated once.
+
+    Parameters
+    ----------
+    formulas
+        The formulas, in the order of the results.
+    constants
+        Values of the names that do not vary (parameters). They are folded with the
+        arithmetic of arrays; what is not finite is kept, for the caller to judge.
+
+    Attributes
+    ----------
+    formulas
+        The formulas.
+    names
+        The names that a call must give values for.
+    variables, template
+        The slot of each of them; of every slot its value where it is constant, else None.
+    instructions, outputs
+        What a call does, and the slots of its results.
+    operations
+        The operations of one call in order, for inspection.
+    live
+        Largest number of arrays at a time, inputs apart.
+    effort, work
+        Their number, at least 1; the same with functions such as the sine counted many times, for
+        the time they take.
+    """
+
+    def __init__(self, formulas: Sequence[Formula], constants: Mapping[str, float] = {}) -> None:
+        self.formulas: tuple[Formula, ...] = tuple(formulas)
+        self._slots: dict[tuple[object, ...], int] = {}
+        self.template: list[float | None] = []  # by slot: a constant, None for what varies
+        self.outputs: list[int] = []
+        instructions: list[Instruction] = []
+        for formula in formulas:
+            placed: list[int] = []
+            for step in formula.steps:
+                key, value = self._identify(step, [placed[k] for k in step.operands], constants)
+                slot = self._slots.setdefault(key, len(self.template))
+                if slot == len(self.template):
+                    self.template.append(value)
+                    if value is None and step.operands:
+                        instructions.append(Instruction(step.operation, key[1], slot))
+                placed.append(slot)
+            self.outputs.append(placed[-1])
+        self.variables = {str(k[1]): s for k, s in self._slots.items() if k[0] == "name"}
+        self.instructions = self._with_lifetimes(_needed(instructions, self.outputs))
+        self.names = frozenset(self.variables)
+        self.operations = tuple(step.operation for step in instructions)
+        self.effort, self.work = _effort(self.operations)
+
+    def _identify(
+        self, step: Step, operands: Sequence[int], constants: Mapping[str, float]
+    ) -> tuple[tuple[str, Any], float | None]:
+        """Return a key, the same for steps with equal bits, and the value if constant."""
+        values = [value for k in operands if (value := self.template[k]) is not None]
+        if step.operation == "constant":
+            value = step.value
+        elif step.name in constants:
+            value = float(constants[step.name])
+        elif operands and len(values) == len(operands):
+            value = fold(step.operation, values)
+        else:
+            return (step.operation, step.name or tuple(operands)), None
+        return ("constant", np.float64(value).tobytes()), value
+
+    def _with_lifetimes(self, instructions: Sequence[Instruction]) -> list[Instruction]:
+        live = set(self.outputs) | {k for k, v in enumerate(self.template) if v is not None}
+        inputs = set(self.variables.values())
+        marked: list[Instruction] = []
+        for step in reversed(instructions):
+            released = tuple(dict.fromkeys(k for k in step.operands if k not in live))
+            live.update(step.operands)
+            in_place = step.operation in PLAIN
+            reusable = tuple(k for k in released if in_place and k not in inputs)
+            marked.append(step._replace(released=released, reusable=reusable))
+        held = self.live = 0
+        for step in reversed(marked):
+            held += 1
+            self.live = max(self.live, held + 1)  # an operation may need one more for itself
+            held -= sum(k not in inputs for k in step.released)
+        return marked[::-1]
+
+    def part(self, outputs: Sequence[int]) -> Program:
+        """Return the program that computes some of the slots, and nothing that they do not need."""
+        part = copy.copy(self)
+        part.outputs = list(outputs)
+        steps = _needed(self.instructions, outputs)
+        read = {*outputs, *(k for step in steps for k in step.operands)}
+        part.variables = {name: k for name, k in self.variables.items() if k in read}
+        part.instructions = part._with_lifetimes(steps)
+        part.names, part.formulas = frozenset(part.variables), ()
+        part.operations = tuple(step.operation for step in part.instructions)
+        part.effort, part.work = _effort(part.operations)
+        return part
+
+    def __call__(
+        self, values: Mapping[str, NDArray[Any] | float], check: Check | None = None
+    ) -> tuple[NDArray[np.float64], ...]:
+        """Evaluate all formulas.
+
+        Parameters
+        ----------
+        values
+            An array or number for each of `names`, in shapes that broadcast together.
+            They are read as float64 and never changed; other keys are ignored.
+        check
+            Called before every operation; it may raise.
+
+        Returns
+        -------
+        tuple of ndarray
+            One new array per formula, in the broadcast shape of the names it uses.
+        """
+        if not self.names <= values.keys():
+            missing = ", ".join(sorted(self.names.difference(values)))
+            raise BadInput(f"no value is given for {missing}; give one for every name")
+        slots: list[Any] = list(self.template)
+        for name, slot in self.variables.items():
+            slots[slot] = np.asarray(values[name], dtype=np.float64)
+        with np.errstate(all="ignore"):
+            for operation, places, target, released, reusable in self.instructions:
+                if check is not None:
+                    check()
+                operands = [slots[k] for k in places]
+                room = _room(operands, [slots[k] for k in reusable]) if reusable else {}
+                slots[target] = OPERATIONS[operation](*operands, **room)
+                for k in released:
+                    slots[k] = None
+        aliases = set(self.variables.values())
+        results: list[NDArray[np.float64]] = []
+        for slot in self.outputs:  # no result shares memory with an input or another result
+            result = np.asarray(slots[slot], dtype=np.float64)
+            results.append(result.copy() if slot in aliases else result)
+            aliases.add(slot)
+        return tuple(results)
+
+    def enclose(self, values: Mapping[str, Jet], check: Check | None = None) -> tuple[Jet, ...]:
+        """Enclose all formulas and their derivatives on boxes (see jets.py).
+
+        Parameters
+        ----------
+        values
+            A jet for each of `names`, all with the same number of directions.
+        check
+            Called before every operation; it may raise.
+        """
+        directions = max((len(jet.slope.low) for jet in values.values()), default=0)
+        slots: list[Any] = [
+            None if value is None else Jet.constant(value, directions) for value in self.template
+        ]
+        for name, slot in self.variables.items():
+            slots[slot] = values[name]
+        with np.errstate(all="ignore"):
+            for step in self.instructions:
+                if check is not None:
+                    check()
+                slots[step.target] = apply(step.operation, [slots[k] for k in step.operands])
+        return tuple(slots[slot] for slot in self.outputs)
+
+
+FUNCTION = 40
+"""Additions that take as long as a sine or a cosine, the slowest functions there are."""
+
+
+def _effort(operations: Sequence[str]) -> tuple[int, int]:
+    """Return the number of operations, and the additions that take as long."""
+    plain = sum(operation in PLAIN for operation in operations)
+    return max(len(operations), 1), max(plain + FUNCTION * (len(operations) - plain), 1)
+
+
+def _needed(instructions: Sequence[Instruction], outputs: Sequence[int]) -> list[Instruction]:
+    """Return the instructions whose results are needed: nothing would ever release the others."""
+    needed, kept = set(outputs), []
+    for step in reversed(instructions):
+        if step.target in needed:
+            needed.update(step.operands)
+            kept.append(step)
+    return kept[::-1]
+
+
+def _room(operands: list[Any], reusable: list[Any]) -> dict[str, Any]:
+    """Return ``out=`` with a reusable array that already has the shape of the result."""
+    for array in reusable:
+        fits = isinstance(array, np.ndarray) and np.broadcast(*operands).shape == array.shape
+        if fits:
+            return {"out": array}
+    return {}

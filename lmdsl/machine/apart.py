@@ -1,0 +1,123 @@
+"""Calls of native solvers in a process of their own, which can be ended.
+
+A solver looks at the clock, and Python at Ctrl-C, only where native code lets them: a factorisation
+may take minutes. What is large, or has a time limit, is therefore done by a child: it gets the
+arguments through a pipe, and is killed a moment after the deadline, or when the caller is
+interrupted. The child imports no more than the function asks for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+from lmdsl.errors import LmdslError
+from lmdsl.machine.deadline import Deadline
+
+Found = TypeVar("Found")
+
+LARGE = 50_000
+"""Entries of a matrix above which native calls may take longer than anybody wants to wait."""
+
+GRACE = 1.0
+"""Seconds after the deadline in which a solver may still say what it found."""
+
+
+class Ended(LmdslError):
+    """The child was ended by somebody else."""
+
+
+def call(
+    function: Callable[..., Found],
+    *arguments: Any,
+    deadline: Deadline,
+    doing: str,
+    entries: int = LARGE,
+) -> Found:
+    """Return ``function(*arguments)``, made by a child where that is worth it.
+
+    Parameters
+    ----------
+    function
+        A function of a module, by name; what it writes to standard output goes to standard error.
+    arguments
+        What can be pickled.
+    deadline, doing
+        When it ends, and what the error then says.
+    entries
+        Size of the matrix; few are not worth a child as long as there is no deadline.
+
+    Raises
+    ------
+    TimeLimitReached
+        The child was ended at the deadline.
+    Ended
+        The child ended otherwise.
+    """
+    small = deadline.left is None and entries < LARGE
+    if small or not sys.executable:  # embedded in another program there is no Python to start
+        return function(*arguments)
+    code = f"import sys; sys.path[:] = {sys.path!r}; from lmdsl.machine.apart import serve; serve()"
+    child = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    assert child.stdin is not None
+    assert child.stdout is not None
+    seconds, watch = deadline.left, None
+    if seconds is not None:
+        watch = threading.Timer(min(seconds + GRACE, threading.TIMEOUT_MAX), child.kill)
+    reply: Any = None
+    try:
+        if watch is not None:
+            watch.start()
+        with contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
+            pickle.dump((function, arguments), child.stdin, protocol=5)
+            child.stdin.close()
+            reply = pickle.load(child.stdout)
+    finally:
+        if watch is not None:
+            watch.cancel()
+        child.kill()
+        with contextlib.suppress(OSError):
+            child.stdin.close()
+        child.stdout.close()
+        status = child.wait()
+    if reply is None:
+        deadline.check(doing)
+        why = f"signal {-status}" if status < 0 else f"status {status}"
+        raise Ended(f"the process of the solver ended ({why}), perhaps for want of memory")
+    error, found = reply
+    if error is not None:
+        raise error
+    return found  # type: ignore[no-any-return]
+
+
+def serve() -> None:
+    """Do the work of the child: read a call from standard input, write what it returns."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller ends us
+    _end_with_the_caller()
+    replies = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what a library prints is no reply
+    function, arguments = pickle.load(sys.stdin.buffer)
+    reply: tuple[BaseException | None, Any]
+    try:
+        reply = None, function(*arguments)
+    except BaseException as error:
+        reply = error, None
+    pickle.dump(reply, replies, protocol=5)
+    replies.flush()
+
+
+def _end_with_the_caller() -> None:
+    """Ask Linux to end us when whoever started us is killed."""
+    with contextlib.suppress(Exception):
+        import ctypes
+
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)

@@ -1,0 +1,1 @@
+"""What a problem becomes: cells, sets, rows, the stabilizable set, the linear program."""

@@ -1,0 +1,318 @@
+"""Arithmetic that depends on the control, line by line in the first-level cache.
+
+On blocks of samples, arrays that vary with the control and the state are many times larger than
+those that vary with one of them. Where they come from plain arithmetic alone, such arrays are never
+made: NumPy evaluates the small ones, and a compiled loop does the rest for a few hundred samples at
+a time, locates the images and sums the costs. Plain arithmetic is correctly rounded, so the bits
+are those of NumPy. Formulas with a sine of the control, say, go the other way (sampler.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Floats
+from lmdsl.formulas.language import PLAIN
+from lmdsl.formulas.program import Instruction, Program
+from lmdsl.machine.kernels import kernel
+from lmdsl.model.assembly.merging import add_cost, settle_cost
+from lmdsl.model.grid.axis import Axis, circle, interval
+
+Integers = NDArray[np.int64]
+
+LINE = 512
+"""Samples at a time: a dozen lines of them fit into the first-level cache."""
+
+LEAST, MOST = 8, 1_000
+"""Instructions worth it: with fewer NumPy is as fast, with many more lines leave the cache."""
+
+# The codes of operations: their places among the plain ones.
+ADD, SUBTRACT, MULTIPLY, DIVIDE, NEGATIVE, ABS, SQRT, FLOOR, CEIL = range(len(PLAIN))
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Formulas split into what NumPy evaluates and what is done line by line.
+
+    Attributes
+    ----------
+    early
+        The program of the small arrays: those outputs that are small, then the inputs of the rest.
+    late
+        For each output its row among the lines, -1 where it is small.
+    tape
+        Code, rows of both operands and row of the result of every instruction, shape (., 4).
+    constants
+        The values of the rows that follow those of the inputs.
+    rows
+        Number of rows.
+    """
+
+    early: Program
+    late: tuple[int, ...]
+    tape: Integers
+    constants: Floats
+    rows: int
+
+    @classmethod
+    def of(cls, program: Program, controls: Collection[str]) -> Lines | None:
+        """Split a program; None where that does not pay, or large arrays need more than arithmetic.
+
+        Parameters
+        ----------
+        program
+            The formulas.
+        controls
+            Names of the values that vary along one axis, all others varying along the rest.
+        """
+        late = _late(program, controls)
+        if late is None or not LEAST <= len(late) <= MOST:
+            return None
+        made = {step.target for step in late}
+        read = dict.fromkeys(k for step in late for k in step.operands if k not in made)
+        inputs = [k for k in read if program.template[k] is None]
+        constants = [k for k in read if program.template[k] is not None]
+        row = {k: r for r, k in enumerate([*inputs, *constants])}
+        tape, rows = _placed(late, row, {k for k in program.outputs if k in made})
+        return cls(
+            program.part([*(k for k in program.outputs if k not in made), *inputs]),
+            tuple(row[k] if k in made else -1 for k in program.outputs),
+            np.array(tape, dtype=np.int64),
+            np.array([program.template[k] for k in constants], dtype=np.float64),
+            rows,
+        )
+
+    def __call__(
+        self,
+        values: Mapping[str, Any],
+        shape: tuple[int, int, int, int],
+        axes: Sequence[Axis],
+        clip: bool,
+        weights: Floats | None,
+    ) -> tuple[Floats | None, Floats | None]:
+        """Locate the images of a block and average its costs.
+
+        Parameters
+        ----------
+        values
+            Named arrays, as for the program.
+        shape
+            What they broadcast to: (first, points, nodes, last).
+        axes, clip
+            One axis for each of the first outputs, and whether images are moved into the box.
+        weights
+            Of the nodes, where the last output is a cost.
+
+        Returns
+        -------
+        index : shape (first, samples, last)
+            Cells as doubles, NaN outside; None where all images are small.
+        mean : shape (first, last)
+            As :func:`lmdsl.model.assembly.merging.mean_cost` has it; None where the cost is small.
+        """
+        arrays = list(self.early(values))
+        small = [row < 0 for row in self.late]
+        found, inputs = iter(arrays[: sum(small)]), arrays[sum(small) :]
+        base: Any = None  # images on axes that do not depend on the control: located once for all
+        for axis, early in zip(axes, small, strict=False):
+            if early:
+                part = axis.add_index(next(found), clip, None)
+                base = part if base is None else base + part
+        axes = list(axes) if not all(small[: len(axes)]) else []
+        located = [(axis, row) for axis, row in zip(axes, self.late, strict=False) if row >= 0]
+        first, points, nodes, last = shape
+        index = np.empty((first if located else 0, points * nodes, last))
+        paid = self.late[-1] if weights is not None else -1
+        mean = np.zeros((first if paid >= 0 else 0, last))
+        packed = _Inputs.of(inputs if base is None else [*inputs, base])
+        _run(
+            LINE, self.tape, self.constants, self.rows, len(inputs), *packed, *shape,
+            np.array([row for _, row in located], dtype=np.int64),
+            np.array([axis for axis, _ in located], dtype=np.float64).reshape(-1, 6),
+            clip, index, paid, np.ones(nodes) if weights is None else weights, mean,
+        )  # fmt: skip
+        return (index if located else None), (mean if paid >= 0 else None)
+
+
+class _Inputs(NamedTuple):
+    """Small arrays one after the other.
+
+    Attributes
+    ----------
+    flat
+        All their elements.
+    start, stride
+        Where each begins, and its elements between neighbours on each of the four axes, 0 on those
+        it does not depend on; shapes (inputs,) and (inputs, 4).
+    """
+
+    flat: Floats
+    start: Integers
+    stride: Integers
+
+    @classmethod
+    def of(cls, arrays: Sequence[Floats]) -> _Inputs:
+        start, stride = np.zeros(len(arrays), np.int64), np.zeros((len(arrays), 4), np.int64)
+        used = 0
+        for k, array in enumerate(arrays):
+            start[k], step = used, 1
+            for axis in range(1, array.ndim + 1):
+                stride[k, -axis] = step if array.shape[-axis] > 1 else 0
+                step *= array.shape[-axis]
+            used += step
+        flat = np.concatenate([np.zeros(0), *(array.reshape(-1) for array in arrays)])
+        return cls(flat, start, stride)
+
+
+def _late(program: Program, controls: Collection[str]) -> list[Instruction] | None:
+    """Return the instructions whose results vary with a control and something else, in order.
+
+    None where one of them is not plain arithmetic. A square becomes a product.
+    """
+    varies = {k: (name in controls, name not in controls) for name, k in program.variables.items()}
+    late = []
+    for step in program.instructions:
+        kinds = [varies.get(k, (False, False)) for k in step.operands]
+        varies[step.target] = any(c for c, _ in kinds), any(o for _, o in kinds)
+        if not all(varies[step.target]):
+            continue
+        operation, operands = step.operation, step.operands
+        if operation == "**" and program.template[operands[1]] == 2.0:
+            operation, operands = "*", (operands[0], operands[0])
+        if operation not in PLAIN:
+            return None
+        late.append(Instruction(operation, operands, step.target))
+    return late
+
+
+def _placed(
+    late: Iterable[Instruction], row: dict[int, int], kept: Collection[int]
+) -> tuple[list[tuple[int, int, int, int]], int]:
+    """Give every result a row, in ``row``; those that nothing reads any more are used again.
+
+    No result takes the row of an operand, so that the loops of the kernel may run on vectors.
+    """
+    late = list(late)
+    given, rows = set(row), len(row)
+    free: list[int] = []
+    reader = {k: t for t, step in enumerate(late) for k in step.operands}
+    tape = []
+    for t, step in enumerate(late):
+        if free:
+            row[step.target] = free.pop()
+        else:
+            row[step.target], rows = rows, rows + 1
+        a, b = row[step.operands[0]], row[step.operands[-1]]
+        tape.append((PLAIN.index(step.operation), a, b, row[step.target]))
+        read = {k for k in step.operands if reader[k] == t} - given
+        free += [row[k] for k in read.difference(kept)]
+    return tape, rows
+
+
+@kernel(allocates=True)
+def _run(  # type: ignore[no-untyped-def]
+    long, tape, constants, rows, inputs, flat, start, stride, first, points, nodes, last,
+    located, axes, clip, index, paid, weights, mean,
+):  # fmt: skip
+    """Fill ``index`` and ``mean``, those of length 0 apart; see :meth:`Lines.__call__`.
+
+    Parameters
+    ----------
+    long
+        Samples at a time.
+    tape, constants, rows, flat, start, stride
+        See :class:`Lines` and :class:`_Inputs`.
+    inputs
+        Number of rows that hold inputs; one more input is added to the indices of every sample.
+    first, points, nodes, last
+        The shape of the block.
+    located, axes
+        Rows to locate, and the numbers of their axes.
+    paid
+        Row of the cost.
+    """
+    work, least = np.empty((rows, long)), np.zeros(mean.shape)
+    for c in range(len(constants)):
+        work[inputs + c, :] = constants[c]
+    for s in range(points * nodes):
+        p, q = s // nodes, s % nodes
+        for j in range(0, last, long):
+            n = min(long, last - j)
+            for i in range(first):
+                for k in range(inputs):
+                    if i == 0 or stride[k, 0] > 0:
+                        at = start[k] + i * stride[k, 0] + p * stride[k, 1] + q * stride[k, 2]
+                        _load(flat, at + j * stride[k, 3], stride[k, 3], work[k][:n])
+                _compute(tape, work, n)
+                if len(index):
+                    line = index[i, s, j : j + n]
+                    line[:] = 0.0
+                    for k in range(inputs, len(start)):
+                        at = start[k] + i * stride[k, 0] + p * stride[k, 1] + q * stride[k, 2]
+                        _load(flat, at + j * stride[k, 3], stride[k, 3], line)
+                    for a in range(len(located)):
+                        _locate(work[located[a]][:n], axes[a], clip, line)
+                if len(mean):
+                    add_cost(work[paid], weights[q], mean[i, j : j + n], least[i, j : j + n])
+    total = points * weights.sum()
+    for i in range(len(mean)):
+        settle_cost(mean[i], least[i], total)
+
+
+@kernel
+def _load(flat, at, step, line):  # type: ignore[no-untyped-def]
+    if step == 0:
+        line[:] = flat[at]
+    else:
+        for j in range(len(line)):
+            line[j] = flat[at + j]
+
+
+@kernel
+def _locate(image, axis, clip, index):  # type: ignore[no-untyped-def]
+    """Add the indices on one axis; ``axis`` has the fields of :class:`lmdsl.model.grid.partition.Axis`."""
+    low, high, width, cells, stride = axis[0], axis[1], axis[2], axis[3], axis[4]
+    if axis[5] > 0.0:
+        circle(image, low, high, width, cells, stride, index)
+    else:
+        interval(image, low, high, width, cells, stride, clip, index)
+
+
+@kernel
+def _compute(tape, work, n):  # type: ignore[no-untyped-def]
+    """Do the instructions on the first n samples of all rows."""
+    for t in range(len(tape)):
+        x, y, z = work[tape[t, 1]], work[tape[t, 2]], work[tape[t, 3]]
+        code = tape[t, 0]
+        if code == ADD:
+            for j in range(n):
+                z[j] = x[j] + y[j]
+        elif code == SUBTRACT:
+            for j in range(n):
+                z[j] = x[j] - y[j]
+        elif code == MULTIPLY:
+            for j in range(n):
+                z[j] = x[j] * y[j]
+        elif code == DIVIDE:
+            for j in range(n):
+                z[j] = x[j] / y[j]
+        elif code == NEGATIVE:
+            for j in range(n):
+                z[j] = -x[j]
+        elif code == ABS:
+            for j in range(n):
+                z[j] = abs(x[j])
+        elif code == SQRT:
+            for j in range(n):
+                z[j] = np.sqrt(x[j])
+        elif code == FLOOR:
+            for j in range(n):
+                z[j] = np.floor(x[j])
+        elif code == CEIL:
+            for j in range(n):
+                z[j] = np.ceil(x[j])

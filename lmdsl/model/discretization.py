@@ -1,0 +1,151 @@
+"""The finite grids of a problem: sample offsets within a cell, control vectors, noise nodes."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Floats
+from lmdsl.machine import memory
+from lmdsl.problem.problem import ControlRange, ControlValues, Grid, NoiseNormal, Problem, Random
+
+NODE = 400
+"""Bytes for each noise node: its values, its weight, and what orders them."""
+
+
+def offsets(problem: Problem) -> Floats:
+    """Return the sample offsets within a cell, shape (points, d), in [0, 1)."""
+    d = len(problem.state_box)
+    sampling = problem.sampling
+    memory.require(32 * d * sample_points(problem), "sample points")
+    if isinstance(sampling, Grid):
+        k = sampling.per_axis
+        axis = (np.arange(k) + 0.5) / k
+        return np.stack(np.meshgrid(*[axis] * d, indexing="ij"), axis=-1).reshape(-1, d)
+    if isinstance(sampling, Random):
+        return np.random.default_rng(sampling.seed).random((sampling.points, d))
+    from scipy.stats import qmc
+
+    with warnings.catch_warnings():
+        # Balance wants a power of two; any number of points is a valid sample.
+        warnings.simplefilter("ignore", UserWarning)
+        points: Floats = qmc.Sobol(d, scramble=True, seed=sampling.seed).random(sampling.points)
+    return points
+
+
+def sample_points(problem: Problem) -> int:
+    """Return the number of sample points per cell without making them."""
+    sampling = problem.sampling
+    if isinstance(sampling, Grid):
+        return int(sampling.per_axis ** len(problem.state_box))
+    return int(sampling.points)
+
+
+def control_values(problem: Problem) -> list[Floats]:
+    """Return the values of every control."""
+    memory.require(16 * max(map(_count, problem.control_grid.values()), default=0), "controls")
+    return [
+        np.array(axis.values)
+        if isinstance(axis, ControlValues)
+        else np.linspace(axis.low, axis.high, axis.points)
+        for axis in problem.control_grid.values()
+    ]
+
+
+def control_vectors(problem: Problem) -> Floats:
+    """Return the control vectors in C order, shape (M, p); (1, 0) for an autonomous system."""
+    memory.require(24 * control_count(problem) * len(problem.control_grid), "control vectors")
+    values = control_values(problem)
+    if not values:
+        return np.zeros((1, 0))
+    return np.stack(np.meshgrid(*values, indexing="ij"), axis=-1).reshape(-1, len(values))
+
+
+def control_count(problem: Problem) -> int:
+    """Return M without making the control vectors."""
+    return math.prod(map(_count, problem.control_grid.values()))
+
+
+def control_range(problem: Problem) -> tuple[Floats, Floats]:
+    """Return the least and the largest value of every control without making the others."""
+    ends = [
+        (min(axis.values), max(axis.values))
+        if isinstance(axis, ControlValues)
+        else (axis.low, axis.high)
+        for axis in problem.control_grid.values()
+    ]
+    low, high = np.array(ends, dtype=float).reshape(-1, 2).T
+    return low, high
+
+
+def _count(axis: ControlRange | ControlValues) -> int:
+    return len(axis.values) if isinstance(axis, ControlValues) else axis.points
+
+
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """The noise nodes of a problem.
+
+    Attributes
+    ----------
+    values
+        Shape (q, r): q nodes of r noise variables, C-order product; one node without noise.
+    weights
+        Shape (q,), > 0. Probabilities up to rounding: shares divide by their exact sum.
+    group
+        Shape (q,): nodes of equal weight share a group, numbered by first appearance.
+    """
+
+    values: Floats
+    weights: Floats
+    group: NDArray[np.int64]
+
+    def group_weights(self) -> list[float]:
+        """Return the weight of each group."""
+        first = np.unique(self.group, return_index=True)[1]
+        return [float(self.weights[i]) for i in first]
+
+    def exact_total(self) -> Fraction:
+        """Return the exact sum of the weights."""
+        return sum((Fraction(float(w)) for w in self.weights), Fraction(0))
+
+
+def noise_nodes(problem: Problem) -> Nodes:
+    """Return the noise nodes; nodes of zero weight are dropped."""
+    memory.require(node_count(problem) * NODE, "noise nodes")
+    if not problem.noise:
+        return Nodes(np.zeros((1, 0)), np.ones(1), np.zeros(1, dtype=np.int64))
+    variables = []
+    for noise in problem.noise.values():
+        if isinstance(noise, NoiseNormal):
+            x, w = np.polynomial.hermite.hermgauss(noise.normal.points)
+            values, weights = math.sqrt(2) * noise.normal.std * x, w
+        else:
+            values, weights = np.array(noise.values), np.array(noise.weights)
+        kept = weights > 0
+        weights = weights[kept] / math.fsum(weights[kept])
+        variables.append((values[kept], weights))
+    grids = np.meshgrid(*(values for values, _ in variables), indexing="ij", copy=False)
+    weights = np.ones(1)
+    for _, each in variables:  # in the order of the variables, as rounding depends on it
+        weights = np.multiply.outer(weights, each).reshape(-1)
+    kept = weights > 0
+    values = np.stack([grid.reshape(-1)[kept] for grid in grids], axis=-1)
+    weights = weights[kept]
+    _, first, found = np.unique(weights, return_index=True, return_inverse=True)
+    number = np.empty(len(first), dtype=np.int64)
+    number[np.argsort(first)] = np.arange(len(first))
+    return Nodes(values, weights, number[found])
+
+
+def node_count(problem: Problem) -> int:
+    """Return an upper bound of the number of noise nodes without making them."""
+    return math.prod(
+        noise.normal.points if isinstance(noise, NoiseNormal) else len(noise.values)
+        for noise in (problem.noise or {}).values()
+    )

@@ -1,0 +1,352 @@
+"""The local controller C0: feedback on the attractor cells.
+
+The controller of the LP, C1, brings every cell to the attractor A and says nothing inside. C0 is
+constant, linear or LQR feedback around a fixed point or a periodic orbit x_0, x_1, ...; each
+attractor cell belongs to the orbit point nearest to its centre. Controls are clipped to the range
+of the control grid. Together they are the paper's feedback: C0 near the attractor, C1 outside.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.frozen import Frozen
+from lmdsl.common.types import Check, Floats, Indices
+from lmdsl.errors import BadInput
+from lmdsl.formulas.enclosures import Jet
+from lmdsl.formulas.intervals import Interval
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model import riccati
+from lmdsl.model.discretization import Nodes, control_range, noise_nodes
+from lmdsl.model.grid.partition import Partition
+from lmdsl.problem.declarations import ConstantControl, LinearFeedback, LqrFeedback
+from lmdsl.problem.problem import Problem
+
+MAX_RICCATI = 256  # states of the Riccati equation: orbit points times axes
+PART = 2**12  # states compared with all points of an orbit at a time
+ON_ORBIT = 1e-3  # cell widths by which a point may miss its successor
+
+
+def _on_arrays(operation: str, *operands: Any) -> Any:
+    return {"rint": np.rint, "min": np.minimum, "max": np.maximum}[operation](*operands)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalController(Frozen):
+    """u = clip(u_k - K_k (x - x_k)), k the orbit point that owns the cell of x.
+
+    Attributes
+    ----------
+    partition, attractor
+        The cells, and which of them it controls, shape (N,).
+    orbit
+        Shape (q, d): the points x_k; the centre of the box for constant control.
+    control
+        Shape (q, p): the controls u_k along the orbit.
+    gain
+        Shape (q, p, d): the feedback matrices K_k.
+    low, high
+        Shape (p,): the range of the control grid, to which controls are clipped.
+    multiplier
+        Largest modulus of the multipliers of the linearised orbit under feedback (eigenvalues of
+        the product of A_k - B_k K_k): below 1, the orbit attracts what is near. None for constant
+        control, which names no orbit, and where the system is not differentiable.
+    """
+
+    partition: Partition
+    attractor: NDArray[np.bool_]
+    orbit: Floats
+    control: Floats
+    gain: Floats
+    low: Floats
+    high: Floats
+    multiplier: float | None
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        partition: Partition,
+        attractor: NDArray[np.bool_],
+        deadline: Deadline | None = None,
+    ) -> LocalController | None:
+        """Return the local controller of a problem, None where it names none.
+
+        Raises
+        ------
+        TimeLimitReached
+            The deadline has passed.
+        BadInput
+            The points are no orbit, lie outside the attractor, a control lies outside its range,
+            or the Riccati equation has no stabilizing solution.
+        """
+        declared = problem.local_controller
+        if declared is None:
+            return None
+        low, high = control_range(problem)
+        where = "local_controller"
+        p, d = len(low), partition.dimension
+        if isinstance(declared, ConstantControl):
+            control = np.array([[declared.control.get(name, 0.0) for name in problem.controls]])
+            _within(control, low, high, problem.controls, where)
+            centre = (partition.low + partition.high)[None, :] / 2
+            gain = np.zeros((1, p, d))
+            return cls(partition, attractor, centre, control.reshape(1, p), gain, low, high, None)
+        orbit = np.array(
+            [
+                [point[name] for name in partition.names] if isinstance(point, dict) else point
+                for point in declared.orbit
+            ]
+        )
+        q = len(orbit)
+        control = np.zeros((q, p))
+        for j, name in enumerate(problem.controls):
+            control[:, j] = declared.control.get(name, 0.0)
+        _within(control, low, high, problem.controls, where)
+        _inside(orbit, partition, attractor)
+        mean = _mean_noise(noise_nodes(problem))
+        check = partial(Deadline.of(deadline).check, "linearising along the orbit")
+        _refuse_unless_orbit(problem, partition, orbit, control, mean, check)
+        width, reach = partition.width, _reach(low, high, control)
+        unit = np.concatenate([width, reach])
+        jacobian = _jacobian(problem, orbit, control, mean, unit, check)
+        A, B = jacobian[:, :, :d], jacobian[:, :, d:]
+        smooth = bool(np.isfinite(jacobian).all())
+        if isinstance(declared, LinearFeedback):
+            gain = np.zeros((q, p, d))
+            for j, u in enumerate(problem.controls):
+                for i, x in enumerate(partition.names):
+                    gain[:, j, i] = declared.gain.get(u, {}).get(x, 0.0)
+        elif not smooth:
+            raise BadInput("the system is not differentiable there", "local_controller.orbit")
+        else:
+            scaled = _regulator(A, B, declared, problem, width, reach)
+            gain = scaled * reach[:, None] / width
+        multiplier = None
+        if smooth:
+            product = np.eye(d)
+            for k in range(q):
+                product = (A[k] - B[k] @ (gain[k] / reach[:, None] * width)) @ product
+            multiplier = float(np.abs(np.linalg.eigvals(product)).max())
+        return cls(partition, attractor, orbit, control, gain, low, high, multiplier)
+
+    def owner(self, cell: Indices) -> Indices:
+        """Return the index of the orbit point nearest to the centre of each cell."""
+        if len(self.orbit) == 1:
+            return np.zeros(len(cell), dtype=np.int64)
+        nearest = np.empty(len(cell), dtype=np.int64)
+        for start in range(0, len(cell), PART):
+            some = slice(start, start + PART)
+            centres = self.partition.centres(cell[some])
+            away = self.deviation(centres[:, None, :], self.orbit[None, :, :])
+            far: Any = sum((away[..., i] / h) ** 2 for i, h in enumerate(self.partition.width))
+            nearest[some] = np.argmin(far, axis=-1)
+        return nearest
+
+    def deviation(self, x: Floats, point: Floats) -> Floats:
+        """Return x - point, on periodic axes the shortest way round."""
+        away = x - point
+        span = self.partition.high - self.partition.low
+        turns = np.where(self.partition.periodic, np.round(away / span), 0.0)
+        return np.asarray(away - turns * span)
+
+    def __call__(self, x: Floats, cell: Indices) -> Floats:
+        """Return the control at states x, shape (r, d), of given attractor cells, shape (r, p)."""
+        u = self.law(list(x.T), cell)
+        return np.stack(u, axis=-1) if u else np.zeros((len(x), 0))
+
+    def law(
+        self, x: Sequence[Any], cell: Indices, apply: Callable[..., Any] = _on_arrays
+    ) -> list[Any]:
+        """Return the controls at states given by axis, arrays or anything else with arithmetic.
+
+        ``apply(name, *operands)`` does the operations ``rint``, ``min`` and ``max``. The order of
+        all operations is fixed, so that an enclosure of them holds for what is computed.
+        """
+        k = self.owner(cell)
+        # By way of the cell's centre: on a circle the law then has no jump inside a cell.
+        centre = self.partition.centres(cell)
+        origin = self.deviation(centre, self.orbit[k])
+        away = []
+        for i, axis in enumerate(self.partition.axes):
+            by = x[i] - centre[:, i]
+            if axis.periodic:
+                span = axis.high - axis.low
+                by = by - apply("rint", by / span) * span
+            away.append(by + origin[:, i])
+        controls = []
+        for j in range(self.gain.shape[1]):
+            u: Any = self.control[k, j]
+            for i, by in enumerate(away):
+                if self.gain[:, j, i].any():
+                    u = u - self.gain[k, j, i] * by
+            u = apply("max", u, self.low[j])
+            controls.append(apply("min", u, self.high[j]))
+        return controls
+
+    def distance(self, x: Floats) -> Floats:
+        """Return the distance from the orbit in cell widths (largest axis), shape (r,)."""
+        distance = np.empty(len(x))
+        for start in range(0, len(x), PART):
+            some = slice(start, start + PART)
+            away = self.deviation(x[some, None, :], self.orbit[None, :, :])
+            distance[some] = np.abs(away / self.partition.width).max(axis=-1).min(axis=-1)
+        return distance
+
+
+def _within(control: Floats, low: Floats, high: Floats, names: tuple[str, ...], where: str) -> None:
+    for j, name in enumerate(names):
+        for u in control[:, j]:
+            if not low[j] <= u <= high[j]:
+                raise BadInput(
+                    f"{float(u)!r} is outside the control grid "
+                    f"[{float(low[j])!r}, {float(high[j])!r}]",
+                    f"{where}.control.{name}",
+                )
+
+
+def _inside(orbit: Floats, partition: Partition, attractor: NDArray[np.bool_]) -> None:
+    for k, point in enumerate(orbit):
+        where = f"local_controller.orbit[{k}]"
+        block = partition.around_point([float(x) for x in point], where)
+        if not attractor[partition.mask([block])].any():
+            raise BadInput("the point lies in no attractor cell; add it to the attractor", where)
+
+
+def _mean_noise(nodes: Nodes) -> Floats:
+    mean: Floats = nodes.weights @ nodes.values / nodes.weights.sum()
+    return mean
+
+
+def _refuse_unless_orbit(
+    problem: Problem,
+    partition: Partition,
+    orbit: Floats,
+    control: Floats,
+    noise: Floats,
+    check: Check,
+) -> None:
+    q = len(orbit)
+    values = {name: orbit[:, k] for k, name in enumerate(problem.states)}
+    values |= {name: control[:, j] for j, name in enumerate(problem.controls)}
+    values |= {name: np.full(q, noise[j]) for j, name in enumerate(problem.noises)}
+    images = np.stack([np.broadcast_to(y, q) for y in problem.step()(values, check)], axis=-1)
+    miss = images - np.roll(orbit, -1, axis=0)
+    span = partition.high - partition.low
+    with np.errstate(invalid="ignore"):
+        miss -= np.where(partition.periodic, np.round(miss / span), 0.0) * span
+    off = np.abs(miss / partition.width).max(axis=1)
+    for k in range(q):
+        if not off[k] <= ON_ORBIT:
+            raise BadInput(
+                f"point {k} is mapped to {[float(y) for y in images[k]]}, {off[k]:.3g} cell widths "
+                "from the next point; give the orbit more precisely, in the order visited, with "
+                "its controls",
+                "local_controller.orbit",
+            )
+
+
+def _reach(low: Floats, high: Floats, control: Floats) -> Floats:
+    """Return the largest distance from a control of the orbit to a value; 1 where it is 0."""
+    far = np.maximum(np.abs(low - control), np.abs(high - control)).max(axis=0)
+    return np.where(far > 0, far, 1.0)
+
+
+def _jacobian(
+    problem: Problem,
+    orbit: Floats,
+    control: Floats,
+    noise: Floats,
+    unit: Floats,
+    check: Check,
+) -> Floats:
+    """Return the derivatives by states and controls, shape (q, d, d + p); NaN at a kink.
+
+    They are per unit of each variable: cell widths, and the reach of the controls.
+    """
+    step, q = problem.step(), len(orbit)
+    names = (*problem.states, *problem.controls)
+    at = np.concatenate([orbit, control], axis=1)
+    fixed = {name: np.full(q, noise[j]) for j, name in enumerate(problem.noises)}
+    if not hasattr(step, "enclose"):
+        return np.moveaxis(_differences(step, names, at, fixed, unit), 2, 0)
+    jets = {
+        name: Jet.variable(Interval.point(at[:, j]), j, len(names)) for j, name in enumerate(names)
+    }
+    jets |= {name: Jet.constant(x, len(names)) for name, x in fixed.items()}
+    slopes = []
+    with np.errstate(invalid="ignore", over="ignore"):
+        for image, own in zip(step.enclose(jets, check), unit, strict=False):
+            per = (unit / own)[:, None]
+            low, high = (per * np.broadcast_to(end, (len(names), q)) for end in image.slope)
+            sharp = np.isfinite(low) & (high - low <= 1e-6 * (1 + np.abs(low)))
+            slopes.append(np.where(sharp, per * image.slope.midpoint, np.nan))
+    return np.moveaxis(np.stack(slopes), 2, 0)
+
+
+def _differences(
+    step: Any, names: tuple[str, ...], at: Floats, fixed: dict[str, Floats], unit: Floats
+) -> Floats:
+    """Differentiate a Python function by central differences with Richardson's extrapolation."""
+    q = len(at)
+
+    def central(j: int, h: float) -> Floats:
+        images = []
+        for sign in (1.0, -1.0):
+            values = {
+                name: at[:, i] + (sign * h if i == j else 0.0) for i, name in enumerate(names)
+            }
+            images.append(np.stack([np.broadcast_to(y, q) for y in step({**values, **fixed})]))
+        own = unit[: len(images[0]), None]
+        return np.asarray((images[0] - images[1]) / own * (unit[j] / (2 * h)))
+
+    columns = []
+    for j in range(len(names)):
+        h = max(1e-2 * float(unit[j]), 1e-5 * float(np.abs(at[:, j]).max()))
+        columns.append((4 * central(j, h / 2) - central(j, h)) / 3)
+    return np.moveaxis(np.stack(columns), 1, 0)  # (d, d + p, q)
+
+
+def _regulator(
+    A: Floats, B: Floats, declared: LqrFeedback, problem: Problem, width: Floats, reach: Floats
+) -> Floats:
+    """Return the gains of the regulator for A, B in units of cell widths and reach of controls."""
+    q, d, p = B.shape
+    where = "local_controller"
+    if q * d > MAX_RICCATI:
+        raise BadInput(f"{q} points of {d} axes; at most {MAX_RICCATI} in all", f"{where}.orbit")
+    if not p:
+        return np.zeros((q, 0, d))
+    weights = (
+        np.array([_scaled(given, name, float(by)) for name, by in zip(names, unit, strict=True)])
+        for given, names, unit in (
+            (declared.state_weights, problem.states, width),
+            (declared.control_weights, problem.controls, reach),
+        )
+    )
+    try:
+        return riccati.regulator(A, B, *weights)
+    except riccati.Unstabilizable as error:
+        raise BadInput(
+            "the controls cannot stabilize the linearisation along the orbit: they do not reach a "
+            f"mode of multiplier {error.multiplier:.6g}; choose another orbit or kind",
+            where,
+        ) from None
+    except (riccati.Unsolved, np.linalg.LinAlgError):
+        raise BadInput(
+            "the Riccati equation along the orbit could not be solved in doubles; choose weights "
+            "that differ less, or kind linear",
+            where,
+        ) from None
+
+
+def _scaled(given: dict[str, float], name: str, unit: float) -> float:
+    """Return the binary logarithm of a weight per unit squared; by default it is 1."""
+    return math.log2(given[name]) + 2 * math.log2(unit) if name in given else 0.0

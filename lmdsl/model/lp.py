@@ -1,0 +1,338 @@
+"""The stabilization LP: the finite model on C, and A, b, c made on demand.
+
+Primal (the paper's equation for theta):  min G'theta  s.t.  (E - gamma P)'theta = m, theta >= 0.
+Dual:  max m'V  s.t.  V[cell(k)] <= gamma (P V)[k] + G[k] for every surviving pair k.
+So ``A = (E - gamma P)'`` is (n, K), ``b = m``, ``c = G``; columns go by cell, then control.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common import inputs
+from lmdsl.common.files import write_whole
+from lmdsl.common.frozen import Frozen, freeze
+from lmdsl.common.types import Floats, Progress
+from lmdsl.errors import BadInput
+from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.forking import cached_property
+from lmdsl.machine.surroundings import own_arithmetic
+from lmdsl.model import stabilizable_set
+from lmdsl.model.assembly.transitions import assemble, require_least, unless_short
+from lmdsl.model.discretization import control_vectors
+from lmdsl.model.grid.directions import Directions
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local_controller import LocalController
+from lmdsl.model.rows import Rows
+from lmdsl.model.sets import Regions
+from lmdsl.model.stabilizable_set import CellStatus, Predecessors
+from lmdsl.problem.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class StabilizationLP(Frozen):
+    """The finite model of a problem on its stabilizable set, and its linear program.
+
+    Attributes
+    ----------
+    problem, partition
+        What was compiled.
+    controls
+        Control vectors, shape (M, p).
+    cell_status
+        Shape (N,), codes of :class:`lmdsl.model.stabilizable_set.CellStatus`.
+    cells
+        The cells of C by their index in the state box, ascending, shape (n,).
+    pair_pointer
+        Shape (n + 1,): the columns of the i-th cell of C are ``pair_pointer[i]:pair_pointer[i+1]``.
+    control
+        Control index of every column, shape (K,), int32.
+    rows
+        Compact transition rows P, one per column; target n is the attractor.
+    cost
+        Stage cost G of every column, shape (K,).
+    gamma
+        Geometric weight of the cost.
+    weight
+        The user's m on C, shape (n,), sum 1; zeros outside the support (all zero where no cell of
+        ``measure`` lies in C).
+
+    Notes
+    -----
+    Backends solve with :attr:`solve_weight`, uniform on C: the optimal V does not depend on a
+    positive weight, while zeros in m would leave V and the controls undetermined there.
+    """
+
+    problem: Problem
+    partition: Partition
+    controls: Floats
+    cell_status: NDArray[np.uint8]
+    cells: NDArray[np.int64]
+    pair_pointer: NDArray[np.int64]
+    control: NDArray[np.int32]
+    rows: Rows
+    cost: Floats
+    gamma: float
+    weight: Floats
+
+    @property
+    def n(self) -> int:
+        """Number of cells of C: rows of the LP."""
+        return len(self.cells)
+
+    @property
+    def K(self) -> int:
+        """Number of surviving pairs: columns of the LP."""
+        return len(self.control)
+
+    @cached_property
+    def cell(self) -> NDArray[np.int32]:
+        """The cell of every column as a position in ``cells``, shape (K,)."""
+        cell = stabilizable_set.owner(self.pair_pointer)
+        freeze(cell)
+        return cell
+
+    @property
+    def A(self) -> Any:
+        """(E - gamma P)', shape (n, K), a SciPy CSC array made anew on each call."""
+        from scipy.sparse import csr_array
+
+        E = csr_array((np.ones(self.K), self.cell, np.arange(self.K + 1)), shape=(self.K, self.n))
+        return (E - self.gamma * self.P).T.tocsc()
+
+    @property
+    def b(self) -> Floats:
+        """The user's m, shape (n,)."""
+        return self.weight
+
+    @property
+    def c(self) -> Floats:
+        """The stage costs, shape (K,)."""
+        return self.cost
+
+    @property
+    def P(self) -> Any:
+        """Transition rows of every column, shape (K, n), a SciPy CSR array made anew."""
+        return self.rows.matrix()
+
+    @property
+    def solve_weight(self) -> Floats:
+        """The weight backends solve with: uniform on C, shape (n,), sum 1."""
+        return np.full(self.n, 1.0 / max(self.n, 1))
+
+    @property
+    def growth(self) -> float:
+        """The weight g = max(gamma, 1) under which a policy must be stabilizing."""
+        return max(self.gamma, 1.0)
+
+    def column(self, cell: int, control: int) -> int | None:
+        """Return the column of (cell index in the box, control index), None if not surviving."""
+        i = int(np.searchsorted(self.cells, cell))
+        if i >= self.n or self.cells[i] != cell:
+            return None
+        first, last = self.pair_pointer[i], self.pair_pointer[i + 1]
+        k = first + int(np.searchsorted(self.control[first:last], control))
+        return int(k) if k < last and self.control[k] == control else None
+
+    def part(self, columns: NDArray[np.int64], inside: NDArray[np.int64]) -> StabilizationLP:
+        """Return the model on some cells and columns; every successor must lie inside or in A.
+
+        Parameters
+        ----------
+        columns
+            Columns to keep, ascending.
+        inside
+            Positions of the cells to keep, ascending; each must keep a column.
+        """
+        columns = inputs.indices(columns, self.K, "columns", "columns")
+        inside = inputs.indices(inside, self.n, "inside", "positions")
+        renumber = np.full(self.n + 1, -1, dtype=np.int32)
+        renumber[inside] = np.arange(len(inside), dtype=np.int32)
+        renumber[self.n] = len(inside)
+        taken = self.rows.take(columns)
+        own, reached = renumber[self.cell[columns]], renumber[taken.target]
+        if len(own) and min(own.min(), reached.min(initial=0)) < 0:
+            raise BadInput("a column belongs or leads to a cell that is left out", "inside")
+        count = np.bincount(own, minlength=len(inside))
+        return replace(
+            self,
+            cells=self.cells[inside],
+            pair_pointer=np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
+            control=self.control[columns],
+            rows=replace(taken, target=reached, columns=len(inside)),
+            cost=self.cost[columns],
+            weight=self.weight[inside],
+        )
+
+    def under(self, pair: NDArray[np.int64]) -> StabilizationLP:
+        """Return the model under a policy, a column per cell: its only policy is ``arange(n)``."""
+        pair = inputs.indices(pair, self.K, "pair", "columns")
+        if (
+            len(pair) != self.n
+            or not ((pair >= self.pair_pointer[:-1]) & (pair < self.pair_pointer[1:])).all()
+        ):
+            raise BadInput("a policy names one column of each cell's own", "pair")
+        return replace(
+            self,
+            pair_pointer=np.arange(self.n + 1, dtype=np.int64),
+            control=self.control[pair],
+            rows=self.rows.take(pair),
+            cost=self.cost[pair],
+        )
+
+    @property
+    def tree(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""
+        level, pair = self._algorithm_1[0].view(), self._algorithm_1[1].view()
+        freeze(level, pair)
+        return level, pair
+
+    @cached_property
+    def _algorithm_1(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """The same as our own code reads it: compiled loops tell read-only arrays from others."""
+        return stabilizable_set.tree(self.pair_pointer, self.rows)
+
+    @property
+    def kernel(self) -> tuple[NDArray[Any], ...]:
+        """The pairs of every cell and their rows as compiled loops read them."""
+        return self.pair_pointer.view(np.uint64), *self.rows.kernel
+
+    @cached_property
+    def directions(self) -> Directions:
+        """Orders in which sweeps visit the cells."""
+        return Directions(self.cells, self.partition.shape)
+
+    @cached_property
+    def predecessors(self) -> Predecessors:
+        """Columns that can reach each cell."""
+        return Predecessors.of(self.rows)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of the compiled model: statuses, pairs, exact transitions, costs, gamma, m."""
+        sha = hashlib.sha256(b"lmdsl model 1\n")
+        sha.update(repr((self.rows.shares.total, [*self.rows.shares.numerator])).encode())
+        sha.update(np.array([self.gamma], dtype="<f8").tobytes())
+        for array, kind in (
+            (self.cell_status, "<u1"),
+            (self.pair_pointer, "<i8"),
+            (self.control, "<i4"),
+            (self.rows.pointer, "<i8"),
+            (self.rows.target, "<i4"),
+            (self.rows.code, "<u4"),
+            (self.cost, "<f8"),
+            (self.weight, "<f8"),
+            (self.controls, "<f8"),
+        ):
+            for part in np.array_split(array.ravel(), max(1, array.size // 2**22)):
+                sha.update(np.ascontiguousarray(part, dtype=kind).tobytes())
+        return sha.hexdigest()
+
+    def expand(self, values: NDArray[Any], attractor: Any, outside: Any) -> NDArray[Any]:
+        """Spread values on C over all N cells."""
+        values = np.asarray(values)
+        if values.shape != (self.n,):
+            raise BadInput(f"values on C have shape ({self.n},), not {values.shape}", "values")
+        full = np.full(self.partition.size, outside, dtype=values.dtype)
+        full[self.cell_status == CellStatus.ATTRACTOR] = attractor
+        full[self.cells] = values
+        return full
+
+    def write_mps(self, path: str | os.PathLike[str]) -> None:
+        """Write the LP in free MPS format, every double with all its digits.
+
+        Row ``d<cell>`` is the balance of a cell, column ``t<cell>_<control>`` its occupation.
+        """
+        if not self.n:
+            raise BadInput("the stabilizable set is empty; there is no LP to write")
+        A = self.A
+        lines = ["NAME lmdsl", "ROWS", " N cost", *(f" E d{i}" for i in self.cells), "COLUMNS"]
+        names = [f"d{i}" for i in self.cells]
+        cell = self.cells[self.cell]
+        for k in range(self.K):
+            column = f" t{cell[k]}_{self.control[k]}"
+            lines.append(f"{column} cost {float(self.cost[k])!r}")
+            span = slice(A.indptr[k], A.indptr[k + 1])
+            lines += [
+                f"{column} {names[i]} {float(v)!r}"
+                for i, v in zip(A.indices[span], A.data[span], strict=True)
+            ]
+        lines.append("RHS")
+        lines += [f" m {names[i]} {float(self.b[i])!r}" for i in np.flatnonzero(self.b)]
+        write_whole(inputs.path(path), ("\n".join([*lines, "ENDATA"]) + "\n").encode())
+
+    def __repr__(self) -> str:
+        return (
+            f"StabilizationLP({self.n} rows, {self.K} columns, {len(self.rows.target)} transitions,"
+            f" gamma={self.gamma!r})"
+        )
+
+
+@own_arithmetic
+def compile(  # noqa: A001
+    problem: Problem,
+    progress: Progress | None = None,
+    time_limit: float | Deadline | None = None,
+) -> StabilizationLP:
+    """Compile a problem: transitions, stabilizable set and the LP on it.
+
+    Parameters
+    ----------
+    problem
+        The declared problem.
+    progress
+        Called with (stage, fraction done) during long work.
+    time_limit
+        Seconds. What takes a moment is compiled whatever the limit.
+
+    Raises
+    ------
+    TimeLimitReached
+        The time limit was reached.
+    BadInput
+        The declared sets have no cells, the stage cost is negative or not finite, or the problem
+        does not fit in memory.
+    """
+    deadline = Deadline.of(time_limit)
+    inputs.kind(problem, Problem, "problem", "a Problem")
+    partition = Partition.of(problem)
+    require_least(problem)
+    patient = unless_short(problem, deadline)
+    if problem.local_controller is not None:  # refuse a wrong one before the work
+        attractor = Regions.of(problem, partition, patient).attractor
+        LocalController.of(problem, partition, attractor, patient)
+    transitions = assemble(problem, partition, progress, deadline)
+    regions = transitions.regions
+    found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
+    kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
+    status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)
+    status[regions.free] = stabilizable_set.causes(found, transitions.pair_pointer)
+    status[regions.attractor] = CellStatus.ATTRACTOR
+    cells = regions.free[found.inside]
+    lp = StabilizationLP(
+        problem=problem,
+        partition=partition,
+        controls=control_vectors(problem),
+        cell_status=status,
+        cells=cells,
+        pair_pointer=pair_pointer,
+        control=transitions.control[kept],
+        rows=rows,
+        cost=transitions.cost[kept],
+        gamma=problem.gamma,
+        weight=regions.weight(cells),
+    )
+    for array in (lp.controls, lp.control, lp.cost):  # views
+        if isinstance(array.base, np.ndarray):
+            freeze(array.base)
+    # The search that found C ends with Algorithm 1 on the surviving pairs.
+    pair = found.pair[found.inside]
+    column = pair if isinstance(kept, slice) else np.searchsorted(kept, pair)
+    vars(lp)["_algorithm_1"] = found.level[found.inside], column
+    return lp

@@ -1,0 +1,202 @@
+"""Compact transition rows: 32-bit targets and small codes instead of doubles.
+
+A row is a list of (target, code). The code stands for the share of the samples that land in the
+target: ``share[code]`` as a double, ``numerator[code] / total`` exactly. Without noise code
+``c - 1`` stands for ``c`` of the S samples. With noise, samples are counted apart for each group
+of nodes of equal weight; a target may then occur several times in a row, and no rounding enters.
+
+The last target, ``columns``, is the attractor: a vector multiplied with the rows has one more
+entry, 0 there. Every row sums to exactly 1 with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.frozen import Frozen
+from lmdsl.machine import threads
+from lmdsl.machine.kernels import ONE, kernel
+from lmdsl.model.discretization import Nodes
+
+PARTS, MANY = 8, 10_000
+"""Ranges into which rows are split for threads, and how many rows are worth it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shares(Frozen):
+    """What the codes of a set of rows stand for.
+
+    Attributes
+    ----------
+    numerator
+        Exact integers, one per code.
+    total
+        Exact integer; ``numerator[code] / total`` is the exact share.
+    value
+        The same as doubles, shape (codes,), each correctly rounded.
+    merged
+        Every target occurs at most once in a row.
+    """
+
+    numerator: Sequence[int]
+    total: int
+    value: NDArray[np.float64]
+    merged: bool = False
+
+    @classmethod
+    def of(cls, points: int, nodes: Nodes) -> Shares:
+        """Return the codes of ``points`` sample points times noise nodes."""
+        if len(nodes.weights) == 1:
+            codes = points
+            return cls(range(1, codes + 1), codes, np.arange(1, codes + 1) / codes, merged=True)
+        exact: list[Fraction] = []
+        sizes = np.bincount(nodes.group)
+        for weight, size in zip(nodes.group_weights(), sizes, strict=True):
+            exact += [Fraction(weight) * count for count in range(1, points * int(size) + 1)]
+        total = points * nodes.exact_total()
+        scale = total.denominator
+        for share in {f.denominator for f in exact}:
+            scale = max(scale, share)  # all are powers of two
+        return cls(
+            numerator=tuple(int(f * scale) for f in exact),
+            total=int(total * scale),
+            value=np.array([float(f / total) for f in exact]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Rows(Frozen):
+    """Transition rows in compressed form.
+
+    Attributes
+    ----------
+    pointer
+        Shape (rows + 1,), int64: row k is ``pointer[k]:pointer[k + 1]``.
+    target
+        int32; ``columns`` stands for the attractor.
+    code
+        uint8, uint16 or uint32, an index into ``shares``.
+    shares
+        What the codes stand for.
+    columns
+        Number of cells a row can reach besides the attractor.
+    """
+
+    pointer: NDArray[np.int64]
+    target: NDArray[np.int32]
+    code: NDArray[np.unsignedinteger]
+    shares: Shares
+    columns: int
+
+    @property
+    def count(self) -> int:
+        """Number of rows."""
+        return len(self.pointer) - 1
+
+    @property
+    def kernel(self) -> tuple[NDArray[Any], ...]:
+        """Pointer, target, code and shares as compiled loops read them.
+
+        Unsigned indices spare Numba the test for negative ones, which costs as much as the sum.
+        """
+        pointer, target = self.pointer.view(np.uint64), self.target.view(np.uint32)
+        return pointer, target, self.code, self.shares.value
+
+    def exact(self, k: int) -> list[tuple[int, int]]:
+        """Return row k as (target, numerator); the numerators sum to ``shares.total``."""
+        span = slice(self.pointer[k], self.pointer[k + 1])
+        return [
+            (int(j), self.shares.numerator[int(c)])
+            for j, c in zip(self.target[span], self.code[span], strict=True)
+        ]
+
+    def take(self, rows: NDArray[np.integer]) -> Rows:
+        """Return some of the rows, in the given order."""
+        chosen = np.ascontiguousarray(rows, dtype=np.int64).view(np.uint64)
+        pointer = np.zeros(len(chosen) + 1, dtype=np.int64)
+        parts = spans(len(chosen))
+
+        def lengths(span: tuple[int, int]) -> None:
+            _lengths(*span, chosen, self.kernel[0], pointer[1:])
+
+        def copy(span: tuple[int, int]) -> None:
+            _take(*span, chosen, *self.kernel[:3], pointer, target, code)
+
+        threads.each(lengths, parts)
+        np.cumsum(pointer, out=pointer)
+        target = np.empty(int(pointer[-1]), dtype=np.int32)
+        code = np.empty(int(pointer[-1]), dtype=self.code.dtype)
+        threads.each(copy, parts)
+        return Rows(pointer, target, code, self.shares, self.columns)
+
+    def matrix(self, rows: NDArray[np.integer] | None = None):  # type: ignore[no-untyped-def]
+        """Return rows as a SciPy CSR array of doubles, shape (len(rows), columns).
+
+        The attractor's share is left out: what a row lacks to 1 is absorbed.
+        """
+        from scipy.sparse import csr_array
+
+        chosen = np.arange(self.count) if rows is None else np.asarray(rows, dtype=np.int64)
+        length = self.pointer[chosen + 1] - self.pointer[chosen]
+        pointer = np.zeros(len(chosen) + 1, dtype=np.int64)
+        np.cumsum(length, out=pointer[1:])
+        small = pointer[-1] < 2**31  # SciPy converts other mixtures of types again and again
+        indptr = np.empty(len(chosen) + 1, dtype=np.int32 if small else np.int64)
+        indices = np.empty(int(pointer[-1]), dtype=indptr.dtype)
+        data = np.empty(int(pointer[-1]))
+        used = _gather(
+            chosen.view(np.uint64), *self.kernel, np.uint32(self.columns), indptr, indices, data
+        )  # fmt: skip
+        matrix = csr_array((data[:used], indices[:used], indptr), shape=(len(chosen), self.columns))
+        if not self.shares.merged:
+            matrix.sum_duplicates()
+        return matrix
+
+
+def spans(count: int) -> list[tuple[int, int]]:
+    """Return the ranges into which so many rows are split for threads."""
+    return threads.ranges(count, PARTS if count >= MANY else 1)
+
+
+@kernel
+def _take(first, last, rows, pointer, target, code, out_pointer, out_target, out_code):  # type: ignore[no-untyped-def]
+    for r in range(np.uint64(first), np.uint64(last)):
+        shift = np.uint64(out_pointer[r]) - pointer[rows[r]]
+        for e in range(pointer[rows[r]], pointer[rows[r] + ONE]):
+            out_target[e + shift] = target[e]
+            out_code[e + shift] = code[e]
+
+
+@kernel
+def _lengths(first, last, rows, pointer, length):  # type: ignore[no-untyped-def]
+    for r in range(np.uint64(first), np.uint64(last)):
+        length[r] = pointer[rows[r] + ONE] - pointer[rows[r]]
+
+
+@kernel
+def _gather(rows, pointer, target, code, share, columns, indptr, indices, data):  # type: ignore[no-untyped-def]
+    """Copy rows without the attractor's share into the arrays of a CSR matrix."""
+    used = np.uint64(0)
+    indptr[0] = 0
+    for r in range(np.uint64(len(rows))):
+        k = rows[r]
+        for e in range(pointer[k], pointer[k + ONE]):
+            if target[e] < columns:
+                indices[used] = target[e]
+                data[used] = share[code[e]]
+                used += ONE
+        indptr[r + ONE] = used
+    return used
+
+
+def code_type(codes: int) -> type[np.unsignedinteger]:
+    """Return the narrowest unsigned type for that many codes."""
+    if codes <= 2**8:
+        return np.uint8
+    return np.uint16 if codes <= 2**16 else np.uint32

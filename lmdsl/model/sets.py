@@ -1,0 +1,159 @@
+"""Which cells are attractor, avoid or free, and where the weight m may be positive."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Check
+from lmdsl.errors import BadInput
+from lmdsl.formulas.program import Program
+from lmdsl.machine import memory
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model.grid.partition import Partition
+from lmdsl.problem.problem import Problem
+
+CELL = 32
+"""Bytes of a cell while the sets are made."""
+
+PART = 2**16
+"""Cells of which the density is evaluated at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """Which cells are attractor (A), avoid (Z) or free (neither).
+
+    Attributes
+    ----------
+    attractor, avoid
+        Masks of shape (N,).
+    mass
+        Weight of every cell before it is intersected with C and scaled, shape (N,).
+    free
+        Indices of the cells outside A and Z, shape (F,), ascending.
+    number
+        Shape (N,), int32: position in ``free``; F for the attractor; -1 for avoid.
+    """
+
+    attractor: NDArray[np.bool_]
+    avoid: NDArray[np.bool_]
+    mass: NDArray[np.float64]
+    free: NDArray[np.int64]
+    number: NDArray[np.int32]
+
+    def weight(self, cells: NDArray[np.integer]) -> NDArray[np.float64]:
+        """Return m on the cells of C: their mass scaled to sum 1, all zero where they have none."""
+        mass = self.mass[cells]
+        if mass.max(initial=0.0) > 1e290:
+            mass = mass / mass.max()  # the sum would overflow
+        equal = len(mass) > 0 and bool((mass == mass[0]).all())
+        total = len(mass) * float(mass[0]) if equal else math.fsum(mass)  # both correctly rounded
+        return mass / total if total > 0 else np.zeros(len(cells))
+
+    @classmethod
+    def of(
+        cls, problem: Problem, partition: Partition, deadline: Deadline | None = None
+    ) -> Regions:
+        """Resolve the attractor, avoid and measure of a problem.
+
+        Raises
+        ------
+        TimeLimitReached
+            The deadline has passed.
+        BadInput
+            A point or index lies outside the box, a set has no cell, or a cell is both
+            attractor and avoid.
+        """
+        memory.require(CELL * partition.size, "the sets of cells")
+        check = partial(Deadline.of(deadline).check, "compiling")
+        attractor = _attractor(problem, partition, check)
+        avoid = np.zeros(partition.size, dtype=np.bool_)
+        if problem.avoid:
+            boxes = (
+                partition.overlapping_box(box, f"avoid.boxes[{i}]")
+                for i, box in enumerate(problem.avoid.boxes)
+            )
+            avoid = partition.mask(boxes, check)
+        both = np.flatnonzero(attractor & avoid)
+        if len(both):
+            index = [int(k) for k in np.unravel_index(both[0], partition.shape)]
+            raise BadInput(f"cell {index} is both attractor and avoid; shrink one of them", "avoid")
+        mass = _mass(problem, partition, check)
+        free = np.flatnonzero(~attractor & ~avoid)
+        number = np.full(partition.size, -1, dtype=np.int32)
+        number[free] = np.arange(len(free), dtype=np.int32)
+        number[attractor] = len(free)
+        return cls(attractor, avoid, mass, free, number)
+
+
+def _mass(problem: Problem, partition: Partition, check: Check) -> NDArray[np.float64]:
+    mass = np.ones(partition.size)
+    measure = problem.measure
+    if measure is None:
+        return mass
+    density = problem.density()
+    if measure.weights is not None:
+        if len(measure.weights) != partition.size:
+            raise BadInput(
+                f"{len(measure.weights)} weights for {partition.size} cells; give one each",
+                "measure.weights",
+            )
+        mass = np.array(measure.weights)
+    elif density is not None:
+        program = Program([density], problem.system.constants())
+        for start in range(0, partition.size, PART):
+            some = np.arange(start, min(start + PART, partition.size))
+            centres = partition.centres(some)
+            mass[some] = program(dict(zip(partition.names, centres.T, strict=True)), check)[0]
+        bad = np.flatnonzero(~((mass >= 0) & np.isfinite(mass)))
+        if len(bad):
+            index = [int(k) for k in np.unravel_index(bad[0], partition.shape)]
+            raise BadInput(
+                f"the density is {float(mass[bad[0]])!r} in cell {index}; it must be finite "
+                "and >= 0",
+                "measure.density",
+            )
+    if measure.boxes is not None:
+        boxes = (
+            partition.inside_box(box, f"measure.boxes[{i}]") for i, box in enumerate(measure.boxes)
+        )
+        inside = partition.mask(boxes, check)
+        if not inside.any():
+            raise BadInput("no cell lies inside the boxes; enlarge them", "measure.boxes")
+        mass[~inside] = 0.0
+    if not mass.any():
+        raise BadInput("no cell carries weight; widen the boxes or the density", "measure")
+    return mass
+
+
+def _attractor(problem: Problem, partition: Partition, check: Check) -> NDArray[np.bool_]:
+    declared = problem.attractor
+    points = (
+        partition.around_point(
+            [point[name] for name in partition.names] if isinstance(point, dict) else point,
+            f"attractor.points[{i}]",
+        )
+        for i, point in enumerate(declared.points)
+    )
+    boxes = (
+        partition.inside_box(box, f"attractor.boxes[{i}]") for i, box in enumerate(declared.boxes)
+    )
+    cells = (tuple(np.array([index]) for index in cell) for cell in declared.cells)
+    for i, cell in enumerate(declared.cells):
+        for k, index in enumerate(cell):
+            if index >= partition.cells[k]:
+                raise BadInput(
+                    f"index {index} is outside 0..{partition.cells[k] - 1} of axis "
+                    f"{partition.names[k]}",
+                    f"attractor.cells[{i}]",
+                )
+    mask = partition.mask(itertools.chain(points, boxes, cells), check)  # one at a time
+    if not mask.any():
+        raise BadInput("no cell lies inside the boxes; enlarge them or give points", "attractor")
+    return mask

@@ -1,0 +1,35 @@
+"""Vectors over C as compiled loops read them, and work split over ranges of its cells."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numpy as np
+
+from lmdsl.common.types import Floats
+from lmdsl.machine import threads
+from lmdsl.model.lp import StabilizationLP
+
+T = TypeVar("T")
+
+GRAIN = 500_000
+"""Transitions that are worth a thread."""
+
+
+def padded(V: Floats) -> Floats:
+    """Append the attractor's 0."""
+    return np.append(np.asarray(V, dtype=np.float64), 0.0)
+
+
+def over_cells(
+    lp: StabilizationLP, part: Callable[[tuple[int, int]], T], most: int = 16
+) -> list[T]:
+    """Call ``part`` on ranges of cells that cover C, in several threads where that pays.
+
+    The ranges, ``most`` at most, do not depend on the number of threads; nor do the results.
+    """
+    count = max(1, min(len(lp.rows.target) // GRAIN, most, lp.n))
+    if count == 1:
+        return [part((0, lp.n))]
+    return threads.each(part, threads.ranges(lp.n, count))

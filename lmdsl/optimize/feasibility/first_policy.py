@@ -1,0 +1,323 @@
+"""A first stabilizing policy for a gamma, or a proof that there is none."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from lmdsl.certificate import bounds
+from lmdsl.common.types import Bools, Floats, Pairs, Stop, never
+from lmdsl.machine.deadline import Stopped
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.feasibility import spectral_radius
+from lmdsl.optimize.linear import equations
+from lmdsl.optimize.linear.gauss_seidel import TOLERANCE
+from lmdsl.optimize.policies import bellman
+from lmdsl.optimize.policies.policy import iterate, peeled, stability_vector
+
+SWEEPS, MOST_ROUNDS = 30, 8
+"""Sweeps after which a proof is given up unless they moved it much less than the ones before."""
+
+LEAST_UNIT = 1e-140
+"""Least unit of a component: quotients of two stay within doubles."""
+
+NEAR = 64
+"""Largest level up to which a few passes from the levels may make a stabilizing policy."""
+
+
+@dataclass(frozen=True, eq=False)
+class Feasible:
+    """A g-stabilizing policy, and a proof of it: w > 0 with w > g P_u w."""
+
+    pair: Pairs
+    w: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Refused:
+    """A candidate proof that no policy is gamma-stabilizing: w >= 0, w <= gamma P_a w for all a.
+
+    ``best`` is a policy that is stabilizing at ``lower`` < gamma.
+    """
+
+    w: Floats
+    best: spectral_radius.Growth
+    lower: float
+
+
+@dataclass(frozen=True, eq=False)
+class Undecided:
+    """gamma is so close to its limit that doubles decide neither way, or time ran out.
+
+    ``pair`` is a policy that is stabilizing at ``lower`` < gamma.
+    """
+
+    pair: Pairs
+    lower: float
+
+
+def _proved(lp: StabilizationLP, pair: Pairs, w: Floats, stop: Stop) -> Floats | None:
+    """Make of a guess a proof that a policy is g-stabilizing; None where it takes too long.
+
+    Where its own value is soon known and every cost positive, it is the proof; else the guess is
+    swept towards the unit-cost value, as long as that is in sight. Else 1 serves where all rows
+    lose mass.
+    """
+    rows, cost = peeled(lp, pair, lp.growth), lp.cost[pair]
+
+    def proves(guess: Floats) -> bool:
+        return bounds.decrease(lp, pair, guess, lp.growth) is not None
+
+    def even() -> Floats | None:
+        ones = np.ones(lp.n)
+        return ones if proves(ones) else None
+
+    paid = rows.small and bool((cost > 0).all())
+    for paid_for in (cost, np.ones(lp.n)) if paid else (np.ones(lp.n),):
+        proof, before = w.copy(), np.inf
+        for _ in range(MOST_ROUNDS):
+            left = equations.advance(rows, paid_for, proof, SWEEPS, 0.0, 0.25)
+            if left == np.inf:
+                return even()
+            if proves(proof):
+                return proof
+            if left > 0.3 * before or left <= TOLERANCE:
+                break
+            if stop():
+                raise Stopped
+            before = left
+        if left > TOLERANCE and equations.lift(rows, paid_for, proof) and proves(proof):
+            return proof
+    return even()
+
+
+def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused | Undecided:
+    """Find a policy that is stabilizing with weight g = max(gamma, 1), or a proof against it.
+
+    Candidates are the greedy policies of value iteration under unit cost from the levels of
+    Algorithm 1, which lie below it, where these are few, then optimal policies under unit cost at
+    gamma = 1 - 1/h, at which no policy costs more than h. Where none does, gamma is raised in
+    steps, each below the limit of the last policy (unit cost, because under a cost with zeros this
+    can stall).
+    """
+    reached: Feasible | Refused | Undecided = Undecided(lp._algorithm_1[1], 0.0)
+    try:
+        for reached in _raising(lp, stop):
+            if not isinstance(reached, Undecided):
+                break
+    except Stopped:
+        pass
+    return reached
+
+
+def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | Undecided]:
+    """Raise gamma step by step; yield what is known after each, the decision last."""
+    g = lp.growth
+    level, pair = lp._algorithm_1
+    V = level.astype(np.float64)
+    for k in range(4 if level.max() <= NEAR else 0):
+        better = bellman.rise(lp, V, g, k % 2 == 1)
+        V = better.value
+        w = _proved(lp, better.pair, V, stop) if k in (0, 3) else None
+        if w is not None:
+            yield Feasible(better.pair, w)
+            return
+    unit, asked = np.ones(lp.K), g == 1
+    for horizon in (4.0 * level.max(), 64.0 * level.max()):
+        at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
+        for _ in range(4):
+            done = iterate(lp, pair, value, at, unit, stop=stop, limit=6)
+            pair, value = done.pair, done.value
+            w = _proved(lp, pair, value, stop)
+            yield Undecided(pair, at) if w is None else Feasible(pair, w)
+            if stop():
+                return
+            if not asked:
+                asked, decided = True, _decided(lp, stop)
+                yield decided
+                if not isinstance(decided, Undecided):
+                    return
+            if done.converged:
+                break
+    for _ in range(200):
+        done = iterate(lp, pair, value, at, unit, stop=stop)
+        pair, value = done.pair, done.value
+        yield Undecided(pair, at)
+        w, _ = stability_vector(lp, pair, stop=stop)
+        if w is not None:
+            yield Feasible(pair, w)
+            return
+        if stop():
+            return
+        # Raise gamma as far towards g as this policy allows, by bisection from above (of exponents,
+        # as long as g is out of sight).
+        reach, raised = g, None
+        while raised is None and reach > at * (1 + 1e-13):
+            far = reach > 4 * at
+            reach = math.sqrt(at) * math.sqrt(reach) if far else at + (reach - at) / 2
+            raised, _ = stability_vector(lp, pair, g=reach, stop=stop)
+        if raised is None:
+            return
+        at, value = reach, raised
+        yield Undecided(pair, at)
+
+
+def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
+    """Decide a gamma > 1 by optimal stopping at gamma' just below gamma, or gamma itself.
+
+    The greatest solution w of w = min(1, gamma' min_a P_a w) is 0 exactly when gamma' < gamma_bar.
+    Then the last policy is stabilizing at gamma', and as a rule at gamma too. Else w is the proof
+    against gamma; the slack absorbs rounding.
+    """
+    best = spectral_radius.improved(lp, spectral_radius.short_lived(lp, stop), stop, lp.gamma)
+    for slack in (1e-6, 1e-9, 1e-12, 0.0):
+        if best.limit > lp.gamma:
+            w, _ = stability_vector(lp, best.pair, stop=stop)
+            if w is not None:
+                return Feasible(best.pair, w)
+        at = lp.gamma * (1 - slack)
+        going = best.rate * at < 1 - 1e-12
+        reward = np.where(going, 1.0, best.x)
+        found = optimal_stopping(lp, at, reward, best.pair, going, stop)
+        if found is None:
+            break
+        if found.refuses:
+            low, _ = spectral_radius.prove_low(lp, best) or (0.0, None)
+            # Small entries may be rounding, or what carries a vector that falls over many decades.
+            w = found.w if bounds.holds_for_all(lp, found.w, lp.gamma, None) else found.carried
+            return Refused(w, best, low)
+        if found.going.all():
+            better = spectral_radius.of_policy(lp, found.pair, stop)
+            best = better if better.limit > best.limit else best
+    return Undecided(best.pair, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Stopping:
+    """The outcome of optimal stopping.
+
+    Attributes
+    ----------
+    w
+        The greatest solution of w = min(reward, gamma min_a P_a w), shape (n,).
+    pair
+        A column for every cell; it counts where ``going``.
+    going
+        Cells that do not stop.
+    converged
+        False where rounding or the limit ended the work.
+    """
+
+    w: Floats
+    pair: Pairs
+    going: Bools
+    converged: bool
+
+    @property
+    def refuses(self) -> bool:
+        """True when w is not 0."""
+        return float(self.w.max(initial=0.0)) > 1e-9
+
+    @property
+    def carried(self) -> Floats:
+        """Return w without the cells at rounding level: their own rows then ask 0 <= something."""
+        return np.where(self.w > 1e-14 * self.w.max(initial=0.0), self.w, 0.0)
+
+
+def optimal_stopping(
+    lp: StabilizationLP,
+    gamma: float,
+    reward: Floats,
+    pair: Pairs | None = None,
+    going: Bools | None = None,
+    stop: Stop = never,
+    limit: int = 1000,
+) -> Stopping | None:
+    """Stop in a cell for ``reward``, or go on under the least favourable control, for ever.
+
+    Howard's policy iteration with "stop" as one more control, as :func:`iterate` makes it. Every
+    policy stays transient under gamma P, so a policy that ends with every cell going and w = 0
+    is gamma-stabilizing.
+
+    Parameters
+    ----------
+    lp, gamma
+        The model and the weight.
+    reward
+        Shape (n,), >= 0.
+    pair, going
+        A first policy, transient under gamma P on the cells that go; default: stop everywhere.
+    stop, limit
+        End the work, with None; largest number of steps.
+    """
+    pair = lp.pair_pointer[:-1].copy() if pair is None else pair
+    going = np.zeros(lp.n, dtype=np.bool_) if going is None else going
+    try:
+        return _stopping(lp, gamma, reward, pair, going, stop, limit)
+    except Stopped:
+        return None
+
+
+def _stopping(
+    lp: StabilizationLP,
+    gamma: float,
+    reward: Floats,
+    pair: Pairs,
+    going: Bools,
+    stop: Stop,
+    limit: int,
+) -> Stopping:
+    zero = np.zeros(lp.K)
+    w = _stopped(lp, gamma, reward, pair, going, reward, stop)
+    if w is None:
+        going = np.zeros(lp.n, dtype=np.bool_)
+        w = reward
+    for step in range(limit):
+        if stop():
+            raise Stopped
+        lowered, new_pair, new_going = w, pair, going
+        for _ in range(step + 1):
+            better = bellman.improve(lp, lowered, gamma, zero)
+            least = np.minimum(better.value, reward)
+            same = np.where(better.value <= reward, new_going & (better.pair == new_pair), False)
+            change = (least < lowered * (1 - 1e-13)) & ~same
+            if not change.any():
+                break
+            lowered = np.where(change, least, lowered)
+            new_pair = np.where(change, better.pair, new_pair)
+            new_going = np.where(change, better.value <= reward, new_going)
+        if lowered is w:
+            return Stopping(np.minimum(w, reward), pair, going, True)
+        new = _stopped(lp, gamma, reward, new_pair, new_going, w, stop)
+        if new is None or not (new < w).any():
+            break  # rounding made a change look better than it is
+        w, pair, going = new, new_pair, new_going
+    return Stopping(np.minimum(w, reward), pair, going, False)
+
+
+def _stopped(
+    lp: StabilizationLP,
+    gamma: float,
+    reward: Floats,
+    pair: Pairs,
+    going: Bools,
+    before: Floats,
+    stop: Stop,
+) -> Floats | None:
+    """Return what a stopping policy is paid: w = gamma P w where it goes, the reward elsewhere.
+
+    It is solved in units of ``before``, as w may fall over many decades.
+    """
+    w = reward.copy()
+    if going.any():
+        unit = np.maximum(before, LEAST_UNIT)
+        P = gamma * lp.rows.matrix(pair[going])
+        P.data *= unit[P.indices] / np.repeat(unit[going], np.diff(P.indptr))
+        new = equations.solve(P[:, going], P[:, ~going] @ (reward / unit)[~going], stop=stop)
+        if new is None:
+            return None
+        w[going] = unit[going] * new
+    return w

@@ -1,0 +1,385 @@
+"""The growth of one policy, class by class: an upper bound of rho(P_u) that anyone can check.
+
+rho(P_u) is the largest spectral radius of a strongly connected class. Each class gets a positive
+vector close to its Perron vector by Noda's iteration; w is these vectors, each scaled so that what
+flows in from the classes it leads to is smaller than the slack: a factor of at most 1/slack for
+each slow class on a way to A, and no more. So a chain of tens of equal slow classes, whose values
+grow over hundreds of decades, costs one pass.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.certificate import bounds
+from lmdsl.common.types import Bools, Floats, Pairs, Stop, never
+from lmdsl.machine.deadline import Stopped
+from lmdsl.machine.forking import cached_property
+from lmdsl.machine.kernels import kernel
+from lmdsl.model.grid.directions import Directions
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.linear import equations
+from lmdsl.optimize.linear.gauss_seidel import System
+from lmdsl.optimize.policies import bellman, policy
+
+TIED = 1e-6
+"""Relative difference up to which two classes count as equally slow."""
+
+LEAST_ENTRY = 1e-250
+"""Least entry of the vector of a class whose largest is 1."""
+
+SLOWER = 1e-3
+"""How much slower than the slowest class one is known to be before its exact rate is left open."""
+
+STEPS, FINE = 100, 1e-11
+"""Steps of Noda's iteration, at most, and the relative width at which it ends."""
+
+PASSES = 8
+"""Passes over all pairs towards a policy from which runs last least."""
+
+HORIZON = 4
+"""A policy should bring runs home within so many times the steps that it takes with luck."""
+
+REACH = 1e-4
+"""First relative step down to a rate that may be too low; then four times as far each time."""
+
+ROUNDS, COARSE, SLIGHT = 100, 1e-2, 1e-10
+"""Improvements of a policy at most; how well its first rates are known; a relative gain of none."""
+
+SMALLEST, LARGEST = 1e-280, 1e300
+"""Range of w."""
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """A policy class by class.
+
+    Attributes
+    ----------
+    pair
+        A column per cell.
+    P
+        Its rows, CSR, shape (n, n).
+    order, ends
+        Its cells by class, every class after all it leads to: see :func:`lmdsl.optimize.linear.equations.classes`.
+    x
+        A positive vector on every class, close to the Perron vector; shape (n,).
+    rate
+        Upper bound of the spectral radius of the class of every cell, up to rounding, shape (n,).
+    known
+        How well the largest rates are known, relative.
+    """
+
+    pair: Pairs
+    P: Any
+    order: NDArray[np.int64]
+    ends: NDArray[np.int64]
+    x: Floats
+    rate: Floats
+    known: float
+
+    @property
+    def limit(self) -> float:
+        """1/rho(P_u): the policy is gamma-stabilizing below it."""
+        rate = float(self.rate.max())
+        return 1 / rate if rate > 0 else math.inf
+
+    @property
+    def slowest(self) -> Bools:
+        """The cells of the classes that set the limit, shape (n,)."""
+        slowest: Bools = self.rate >= self.rate.max() * (1 - TIED)
+        return slowest
+
+    @cached_property
+    def slow_vector(self) -> Floats:
+        """The vectors of these classes, 0 elsewhere, shape (n,)."""
+        return np.where(self.slowest, self.x, 0.0)
+
+
+def of_policy(
+    lp: StabilizationLP,
+    pair: Pairs,
+    stop: Stop = never,
+    start: Floats | None = None,
+    enough: float = FINE,
+    inside: Bools | None = None,
+) -> Growth:
+    """Take a policy apart into classes and estimate the spectral radius of each.
+
+    Parameters
+    ----------
+    lp, pair, stop
+        The model, a column per cell, and what ends the work.
+    start, enough
+        A guess of x, and how well the rates have to be known, relative.
+    inside
+        Cells that alone count: runs that leave them end.
+    """
+    P = lp.rows.matrix(pair)
+    if inside is not None:
+        P.data[~(inside[P.indices] & np.repeat(inside, np.diff(P.indptr)))] = 0.0
+        P.eliminate_zeros()
+    order, ends = equations.classes(P)
+    x, rate = np.ones(lp.n), P.diagonal()
+    lengths = np.diff(ends, prepend=0)
+    several = np.flatnonzero(lengths > 1)
+    slowest = float(rate[order[ends[lengths == 1] - 1]].max(initial=0.0))
+    for k in several[np.argsort(lengths[several], kind="stable")]:
+        cells = np.sort(order[ends[k] - lengths[k] : ends[k]])
+        directions = lp.directions.among(cells) if len(cells) >= equations.KRYLOV else None
+        begin = None if start is None else start[cells]
+        x[cells], rate[cells], least = _perron(
+            P[cells][:, cells], stop, slowest, directions, begin, enough
+        )
+        slowest = max(slowest, least)
+    return Growth(pair, P, order, ends, x, rate, enough)
+
+
+def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
+    """Return a policy that brings runs home within a few steps, as far as any is known to do.
+
+    From the levels of Algorithm 1, w <- min_a P_a w weighs what has not arrived by then. Where runs
+    last under the policy that comes out, as on long ways, the optimum under unit cost, discounted,
+    may be better, or the policy of the levels.
+    """
+    level, pair = lp._algorithm_1
+    horizon = float(HORIZON * level.max())
+
+    def candidates() -> Iterator[tuple[Pairs, Floats | None]]:
+        w, zero = level.astype(np.float64), np.zeros(lp.K)
+        for _ in range(PASSES):
+            done = bellman.improve(lp, w, 1.0, zero)
+            w = done.value
+        yield done.pair, None
+        unit, value = np.ones(lp.K), np.full(lp.n, horizon)
+        found = policy.iterate(lp, pair, value, 1 - 1 / horizon, unit, stop=stop)
+        yield found.pair, found.value
+        yield pair, None
+
+    best: Growth | None = None
+    for candidate, start in candidates():
+        one = of_policy(lp, candidate, stop, start, COARSE)
+        if one.limit <= 1 + 1 / horizon:
+            one = of_policy(lp, candidate, stop, one.x, 0.1 / horizon)
+        best = one if best is None or one.limit > best.limit else best
+        if stop() or best.limit > 1 + 1 / horizon:
+            break
+    assert best is not None
+    return best
+
+
+def improved(
+    lp: StabilizationLP,
+    found: Growth,
+    stop: Stop = never,
+    until: float = math.inf,
+    least: float = 1e-2 * TIED,
+    inside: Bools | None = None,
+) -> Growth:
+    """Raise the limit of a policy by Howard's policy iteration.
+
+    A control a with (P_a w)_i < (P_u w)_i keeps P_u w <= lam w, w > 0 being the vector that proves
+    the limit 1/lam: no step lowers it. While the limit still rises fast, the rates need not be
+    known well.
+
+    Parameters
+    ----------
+    lp, found, stop
+        The model, a policy, and what ends the work.
+    until, least
+        A limit that is enough, and the relative gain of a step below which it is the last.
+    inside
+        As in :func:`of_policy`, of which ``found`` then comes.
+    """
+    enough = COARSE
+    with suppress(Stopped):
+        for _ in range(ROUNDS):
+            w = lifted(found)
+            if w is None or stop() or found.limit > until:
+                break
+            new = _greedy(lp, found, w, enough, stop, inside)
+            gain = 0.0 if new is None else new.limit / found.limit - 1
+            if new is not None and gain > 0:
+                found, enough = new, min(enough, max(FINE, 1e-2 * gain))
+            elif found.known <= FINE:
+                break
+            if gain < least and found.known > FINE:
+                found = of_policy(lp, found.pair, stop, found.x, FINE, inside)
+            if 0 < gain < least:
+                break
+    return found
+
+
+def _greedy(
+    lp: StabilizationLP, found: Growth, w: Floats, enough: float, stop: Stop, inside: Bools | None
+) -> Growth | None:
+    """Return the policy that is better for the w of another, None where none is."""
+    w = w if inside is None else np.where(inside, w, 0.0)
+    best = bellman.improve(lp, w, 1.0, np.zeros(lp.K))
+    change = best.value < (found.P @ w) * (1 - SLIGHT)
+    if not change.any():
+        return None
+    pair = np.where(change, best.pair, found.pair)
+    new = of_policy(lp, pair, stop, found.x, enough, inside)
+    if new.limit <= found.limit * (1 + enough):
+        return of_policy(lp, pair, stop, new.x, FINE, inside)
+    return new
+
+
+def _perron(
+    inner: Any,
+    stop: Stop,
+    slowest: float = 0.0,
+    directions: Directions | None = None,
+    start: Floats | None = None,
+    enough: float = FINE,
+) -> tuple[Floats, float, float]:
+    """Return x > 0, the largest (M x)_i / x_i, and the least, for an irreducible M >= 0.
+
+    For a bound at > rho, y = (I - M/at)^-1 x is positive and (M y)_i / y_i < at. Noda's iteration
+    takes for ``at`` the largest (M x)_i / x_i so far: it falls to rho, quadratically in the end.
+    Where it falls slowly, as it does if x spans many decades, ``at`` is taken halfway down to a
+    lower bound: the least (M x)_i / x_i, or an ``at`` that gave no positive y. Whatever x > 0 it
+    ends with, max (M x)_i / x_i >= rho holds. It ends early where that is below ``slowest``, the
+    rate of another class. In a large class, with its ``directions``, y is found by Krylov's method;
+    a y that is not exact only takes a step more.
+    """
+    n = inner.shape[0]
+    dense = inner.toarray() if n <= equations.DENSE else None
+    M = inner if dense is None else dense
+    slow_fall = 0.1 if directions is None else 0.9
+    x = np.ones(n)
+    ahead = M @ x
+    if start is not None and (M @ start < float(ahead.max()) * start).all():
+        x = start / start.max()
+        ahead = (M @ x) / x
+    top, bottom = float(ahead.max()), float(ahead.min())
+    least, halve, reach = bottom, False, REACH
+    for _ in range(STEPS):
+        width = top - bottom
+        if width <= enough * top or top < slowest * (1 - SLOWER):
+            break
+        # A little off top, so that the last steps are not singular.
+        middle = max((top + bottom) / 2, top * (1 - reach))
+        at = middle if halve else top * (1 + 1e-9)
+        y = _solved(M / at, x, stop, directions)
+        if y is None:
+            if not halve:
+                break
+            bottom, reach = at, 1.0
+            continue
+        reach *= 4 if halve else 1
+        ahead_y = M @ y
+        ratio = ahead_y / y
+        least = max(least, float(ratio.min()))
+        bottom = max(bottom, least)
+        if ratio.max() < top:
+            x, top = y, float(ratio.max())
+        elif not halve:
+            break
+        else:
+            bottom = at  # rounding ends here
+        halve = not top - bottom < slow_fall * width
+    return x, top, least
+
+
+def _solved(M: Any, x: Floats, stop: Stop, directions: Directions | None) -> Floats | None:
+    """Return y = x + M y, largest entry 1, None where it is not positive or leaves doubles."""
+    if isinstance(M, np.ndarray):
+        try:
+            y: Any = np.linalg.solve(np.eye(len(x)) - M, x)
+        except np.linalg.LinAlgError:
+            return None
+    elif directions is None:
+        y = equations.solve(M, x, stop=stop)
+    else:
+        scaled = M.copy()  # all sizes alike, as a Krylov method wants them
+        scaled.data *= x[M.indices] / np.repeat(x, np.diff(M.indptr))
+        y = equations.guess(
+            replace(System.of(scaled), directions=directions), np.ones(len(x)), stop
+        )
+        y = None if y is None else x * y
+    if y is None or not np.isfinite(y).all() or not y.min() > 0:
+        return None
+    y = x + M @ y  # sums of positive numbers: every entry to its own precision
+    y = y / y.max()
+    return np.asarray(y, dtype=np.float64) if y.min() >= LEAST_ENTRY else None
+
+
+def prove_low(lp: StabilizationLP, found: Growth) -> tuple[float, Floats] | None:
+    """Return a proved low of a policy and its w."""
+    w = lifted(found)
+    low = None if w is None else check_low(lp, found.pair, w)
+    return None if w is None or low is None else (low, w)
+
+
+def lifted(found: Growth) -> Floats | None:
+    """Return w > 0 with P_u w <= lam w, with the least slack that doubles allow."""
+    P, w, rho = found.P, np.empty(len(found.x)), float(found.rate.max())
+
+    def fits(power: float) -> bool:
+        bound = rho * (1 + 10.0**power)
+        return bool(_scale(P.indptr, P.indices, P.data, found.order, found.ends, found.x, bound, w))
+
+    power, failed = -9.0, -9.0
+    if not fits(power):
+        power = 3.0  # where the scales do not grow any more
+        while power - failed > 0.02:
+            middle = (power + failed) / 2
+            power, failed = (middle, failed) if fits(middle) else (power, middle)
+        if not fits(power):
+            return None
+    return w
+
+
+def check_low(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
+    """Return the largest low (rounded down) with low P_u w <= w, None where w > 0 fails."""
+    if not (np.isfinite(w).all() and (w > 0).all()):
+        return None
+    ahead = bounds.expected_above(lp, pair, w, 1.0)
+    with np.errstate(divide="ignore", over="ignore"):
+        ratio = np.where(ahead > 0, np.minimum(w / ahead, sys.float_info.max), np.inf)
+    return float(ratio.min()) * (1 - 4 * bounds.UNIT)
+
+
+@kernel(allocates=True)
+def _scale(indptr, indices, data, order, ends, x, bound, w):  # type: ignore[no-untyped-def]
+    """Scale the vector of each class so that P w <= bound w; False where doubles end.
+
+    Classes are met after all they lead to. In class c, with w = s x: inner + outer <= bound s x
+    asks s >= outer / (bound x - inner), inner = (P x) within the class, outer = (P w) beyond it.
+    """
+    label = np.full(len(order), -1)
+    begin = 0
+    for c in range(len(ends)):
+        for p in range(begin, ends[c]):
+            label[order[p]] = c
+        scale = 0.0
+        for p in range(begin, ends[c]):
+            i = order[p]
+            scale = max(scale, SMALLEST / x[i])
+            inner, outer = 0.0, 0.0
+            for e in range(indptr[i], indptr[i + 1]):
+                j = indices[e]
+                if label[j] == c:
+                    inner += data[e] * x[j]
+                else:
+                    outer += data[e] * w[j]
+            margin = bound * x[i] - inner
+            if margin <= 0.0:
+                return False
+            scale = max(scale, outer / margin)
+        if not scale < LARGEST:
+            return False
+        for p in range(begin, ends[c]):
+            w[order[p]] = scale * (1 + 1e-12) * x[order[p]]
+        begin = ends[c]
+    return True

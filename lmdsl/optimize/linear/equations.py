@@ -1,0 +1,488 @@
+"""Solving x = b + M x for a nonnegative sparse M: the evaluation of a fixed policy.
+
+For b >= 0 the smallest nonnegative solution is sum M^k b, finite for every b exactly when the
+spectral radius of M is below 1. The cells outside the core, most of them as a rule, are solved by
+substitution (peeling.py). On the core Gauss-Seidel sweeps converge, from any x >= 0, at least as
+fast as Jacobi's, and keep every iterate >= 0. Where they converge slowly and cells are many, a
+Krylov method makes a better guess. Where that does not help the system is solved directly, class by
+class: the strongly connected classes of M are visited in an order in which
+everything a class leads to is known, single cells by substitution, larger classes by sparse LU.
+Values may then span hundreds of decades, as a chain of slow classes makes them do, and each class
+is still solved to its own precision. Whether an answer is good enough is judged by the certificate.
+"""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Floats, Stop, never
+from lmdsl.machine.deadline import Stopped
+from lmdsl.machine.kernels import kernel
+from lmdsl.optimize.linear import extrapolation
+from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, TOLERANCE, System
+from lmdsl.optimize.linear.substitution import Peeled
+
+TRIAL_SWEEPS = 60
+MAX_SWEEPS = 200_000
+MAX_FACTORED = 100_000
+DENSE = 50
+KRYLOV, KRYLOV_STEPS, KRYLOV_SWEEPS = 1000, 200, 1600
+"""Least size of a system, most steps, and most sweeps in them, two cycles each."""
+FEW_SWEEPS, MANY_SWEEPS = 100, 300
+"""Sweeps that are made rather than Krylov's steps, and rather than a sparse factorisation."""
+PER_CORE = 20
+"""The core may be swept more often than all cells, up to so many times."""
+
+_filtering = threading.Lock()
+"""Filters of warnings belong to the process: one thread at a time changes and restores them."""
+
+
+def solve(
+    M: Any,
+    b: Floats,
+    start: Floats | None = None,
+    enough: float = TOLERANCE,
+    flat: float = 0.0,
+    stop: Stop = never,
+) -> Floats | None:
+    """Return x >= 0 with x = b + M x, or None where there is none (as far as rounding can tell).
+
+    Parameters
+    ----------
+    M
+        Sparse CSR array of shape (n, n), entries >= 0.
+    b
+        Shape (n,), entries >= 0.
+    start
+        A guess, shape (n,), >= 0.
+    enough, flat
+        Relative, and absolute, change of a sweep that ends the work.
+    stop
+        Asked after the first few sweeps, then again and again between sweeps and classes.
+
+    Raises
+    ------
+    Stopped
+        ``stop`` said so.
+    """
+    x = np.array(b if start is None else start, dtype=np.float64)
+    peeled = Peeled.of(System.of(M))
+    return x if solve_from(peeled, b, x, lambda: M, enough, flat, stop) else None
+
+
+def solve_from(
+    peeled: Peeled,
+    b: Floats,
+    x: Floats,
+    matrix: Callable[[], Any],
+    enough: float = TOLERANCE,
+    flat: float = 0.0,
+    stop: Stop = never,
+) -> bool:
+    """Solve in place from a guess; ``matrix`` makes M, as a CSR array, where sweeps are slow."""
+    core, inner = peeled.core, peeled.inner
+    whole = inner is peeled.system
+
+    def part() -> Any:
+        return matrix() if whole else matrix()[core][:, core]
+
+    guess, c = (x, b) if whole else (x[core], b[core])
+    y = _solve(inner, c, guess, part, enough, flat, stop)
+    if y is None:
+        return False
+    x[core] = y
+    return peeled.substitute(b, x)
+
+
+def solve_transposed(
+    peeled: Peeled,
+    b: Floats,
+    matrix: Callable[[], Any],
+    start: Floats | None = None,
+    enough: float = TOLERANCE,
+    flat: float = 0.0,
+    stop: Stop = never,
+) -> Floats | None:
+    """Return x >= 0 with x = b + M'x, or None; parameters as in :func:`solve_from`."""
+    x, core = b.copy(), peeled.core
+    if not peeled.flow(x):
+        return None
+    inner = peeled.inner.transposed()
+
+    def part() -> Any:
+        return matrix()[core][:, core].T.tocsr()
+
+    c = x[core]
+    y = _solve(inner, c, c.copy() if start is None else start[core], part, enough, flat, stop)
+    if y is None:
+        return None
+    x[core] = y
+    return x
+
+
+def advance(peeled: Peeled, b: Floats, x: Floats, count: int, enough: float, flat: float) -> float:
+    """Come closer to x = b + M x in place, by about the work of ``count`` sweeps.
+
+    From x >= b + M x it lowers x, from below it raises it, as sweeps do. A small core is swept to
+    the end where that is not too much work, then substituted from; where it is not small, all
+    cells are swept until the largest relative change is ``enough`` or no component moves by more
+    than ``flat``.
+
+    Returns
+    -------
+    float
+        Largest relative change of the last sweep, at most ``TOLERANCE`` where x is the solution;
+        infinite where there is none in sight.
+    """
+    if not peeled.small:
+        return peeled.system.sweep(b, x, count, enough, flat)[1]
+    change = 0.0
+    if len(peeled.core):
+        y = x[peeled.core]
+        count *= min(len(x) // len(y), PER_CORE)
+        change = peeled.inner.sweep(b[peeled.core], y, count, TOLERANCE)[1]
+        if not change < np.inf:
+            return np.inf
+        x[peeled.core] = y
+    return change if peeled.substitute(b, x) else np.inf
+
+
+def descend(peeled: Peeled, b: Floats, x: Floats, enough: float, stop: Stop = never) -> bool:
+    """Lower x >= b + M x in place, b > 0, by a Krylov method; False where that fails.
+
+    Its y is close to the solution, not above b + M y. With r = b + M y - y and t >= max(r / b),
+    y + t x is: (I - M)(y + t x) >= b - r + t b.
+    """
+    whole = not peeled.small
+    system, c = (peeled.system, b) if whole else (peeled.inner, b[peeled.core])
+    v = x if whole else x[peeled.core]
+    if len(v):
+        y = _krylov(system, c, v, stop, max(enough, 1e-13))
+        if y is None:
+            return False
+        system.sweep(c, y, len(system.directions.cycle))
+        share = float((system.residual(c, y) / (system.inverse * c)).max(initial=0.0))
+        y += share * (1 + 1e-9) * v
+        if not (y < CEILING).all():
+            return False
+        np.minimum(v, y, out=v)
+        if not whole:
+            x[peeled.core] = v
+    return whole or peeled.substitute(b, x)
+
+
+def lift(peeled: Peeled, b: Floats, x: Floats) -> bool:
+    """Raise x in place to x >= b + M x, along the slowest mode; False where that fails.
+
+    It is the mode of the core where that is small, else of all cells.
+    """
+    if not peeled.small:
+        return extrapolation.lift(peeled.system, b, x)
+    y = x[peeled.core]
+    if not extrapolation.lift(peeled.inner, b[peeled.core], y):
+        return False
+    x[peeled.core] = y
+    return peeled.substitute(b, x)
+
+
+def _solve(
+    system: System,
+    b: Floats,
+    x: Floats,
+    matrix: Callable[[], Any],
+    enough: float,
+    flat: float,
+    stop: Stop,
+) -> Floats | None:
+    """Solve from a guess, which is overwritten, by sweeps or class by class."""
+    nothing = ~_pays(system, b) if (b == 0).any() else None
+    if nothing is not None:
+        x[nothing] = 0.0  # exactly: a guess would only fade there
+    change, rate = _trial(system, b, x, enough, flat)
+    if change <= enough:
+        return x
+    guess = None
+    if len(b) >= KRYLOV and not _soon(change, rate, FEW_SWEEPS):
+        guess = _krylov(system, b, x, stop)
+    if guess is not None:
+        x = guess
+        if nothing is not None:
+            x[nothing] = 0.0
+        change, rate = _trial(system, b, x, enough, flat)
+        if change <= enough:
+            return x
+    if not _soon(change, rate, MANY_SWEEPS):
+        direct, small_enough = solve_by_class(matrix(), b, stop)
+        if direct is not None or small_enough:
+            return direct
+    for _ in range(MAX_SWEEPS // TRIAL_SWEEPS):
+        if stop():
+            raise Stopped
+        change, rate = _trial(system, b, x, enough, flat)
+        if change <= enough:
+            return x
+        if not np.isfinite(change) or x.max() > CEILING:
+            return None
+    return None
+
+
+def guess(system: System, b: Floats, stop: Stop = never) -> Floats | None:
+    """Return x close to b + M x by a Krylov method and sweeps alone; None where it breaks down."""
+    x = _krylov(system, b, b.copy(), stop)
+    if x is not None:
+        system.sweep(b, x, TRIAL_SWEEPS // 3)
+    return x
+
+
+def _krylov(
+    system: System, b: Floats, x: Floats, stop: Stop, enough: float = 1e-13
+) -> Floats | None:
+    """Return a better guess by BiCGSTAB (van der Vorst 1992), None where it breaks down.
+
+    A cycle of sweeps in all directions maps x to S x + s; it solves x - S x = s, in one step for
+    each mode that hinders sweeps, such as the slow escape from a well-mixed set. A solution >= 0 is
+    the right one: the left Perron vector of a class with spectral radius 1
+    or more contradicts x >= b + M x > 0 there. SciPy's breaks down at absolute sizes, and its sums
+    depend on the number of BLAS threads.
+    """
+    count, zero = len(system.directions.cycle), np.zeros(len(b))
+
+    def swept(c: Floats, v: Floats) -> Floats:
+        v = v.copy()
+        system.sweep(c, v, count, enough=-1.0, flat=-1.0)
+        return v
+
+    if system.inverse.max() >= NEVER:
+        return None
+    with np.errstate(all="ignore"):
+        unit = float((system.inverse * b).max())
+        if not 0 < unit < CEILING:
+            return None
+        known, steps = swept(b / unit, zero), min(KRYLOV_STEPS, KRYLOV_SWEEPS // (2 * count))
+        y = _bicgstab(lambda v: v - swept(zero, v), known, x / unit, steps, stop, enough)
+        guess = np.maximum(unit * y, b)
+    if not (guess < CEILING).all() or y.min() < -1e-9 * y.max():
+        return None
+    return guess
+
+
+def _bicgstab(
+    applied: Callable[[Floats], Floats],
+    b: Floats,
+    x: Floats,
+    steps: int,
+    stop: Stop,
+    enough: float,
+) -> Floats:
+    """Solve applied(x) = b to a relative residual ``enough``, or make so many steps."""
+
+    def dot(u: Floats, v: Floats) -> Any:
+        return (u * v).sum()
+
+    x = np.where(np.isfinite(x), x, 0.0)
+    r = b - applied(x)
+    shadow, p, rho = r, r, dot(r, r)
+    least = enough * enough * dot(b, b)
+    for _ in range(steps):
+        if not dot(r, r) > least or rho == 0.0:
+            break
+        if stop():
+            raise Stopped
+        q = applied(p)
+        alpha = rho / dot(shadow, q)
+        s = r - alpha * q
+        t = applied(s)
+        omega = dot(t, s) / dot(t, t) if t.any() else np.float64(0.0)
+        following = x + alpha * p + omega * s
+        if not np.isfinite(following).all():
+            break
+        x = following
+        r = s - omega * t
+        before, rho = rho, dot(shadow, r)
+        p = r + (rho / before) * (alpha / omega) * (p - omega * q)
+    return x
+
+
+def _pays(system: System, b: Floats) -> NDArray[np.bool_]:
+    """Return where x > 0: the cells from which some b > 0 can be reached."""
+    pays, before = b > 0, system.transposed()
+    _spread(before.begin, before.end, before.indices, pays)
+    return pays
+
+
+def _soon(change: float, rate: float, sweeps: int) -> bool:
+    """Return whether so many sweeps more should suffice."""
+    if not (change < np.inf and rate < 1):
+        return False
+    return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < sweeps)
+
+
+def _trial(system: System, b: Floats, x: Floats, enough: float, flat: float) -> tuple[float, float]:
+    """Sweep; return the last relative change, and the factor by which a sweep shrinks it."""
+    halfway, last = system.sweep(b, x, TRIAL_SWEEPS, enough, flat)
+    rate = (last / halfway) ** (2 / TRIAL_SWEEPS) if 0 < halfway < np.inf else 0.0
+    return last, rate
+
+
+def solve_by_class(M: Any, b: Floats, stop: Stop = never) -> tuple[Floats | None, bool]:
+    """Solve class by class; return x or None, and whether every class was small enough to try."""
+    order, ends = classes(M)
+    lengths = np.diff(ends, prepend=0)
+    count = len(ends)
+    if lengths.max(initial=0) > MAX_FACTORED:
+        return None, False
+    x = np.zeros(len(b))
+    begun = 0
+    for k in np.append(np.flatnonzero(lengths > 1), count):
+        until = ends[k - 1] if k else 0
+        if not _substitute(M.indptr, M.indices, M.data, order[begun:until], b, x):
+            return None, True
+        if k == count:
+            break
+        if stop():
+            raise Stopped
+        cells = order[until : ends[k]]
+        if not _solve_class(M, b, x, cells):
+            return None, True
+        begun = ends[k]
+    return x, True
+
+
+def classes(M: Any) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the cells ordered by strongly connected class, and where each class ends.
+
+    Every class comes after all it leads to: class k is ``order[ends[k - 1]:ends[k]]``.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    count, label = connected_components(M, directed=True, connection="strong")
+    rank = _topological(M.indptr, M.indices, label, count)
+    lengths = np.empty(count, dtype=np.int64)
+    lengths[rank] = np.bincount(label, minlength=count)
+    return np.argsort(rank[label], kind="stable"), np.cumsum(lengths)
+
+
+def _solve_class(M: Any, b: Floats, x: Floats, cells: NDArray[np.int64]) -> bool:
+    """Solve one strongly connected class in place; False where it has no finite solution."""
+    rows = M[cells]
+    known = b[cells] + rows @ x
+    scale = float(known.max())
+    if scale == 0.0:
+        return True  # nothing is paid here or after: 0, whatever the class does
+    if not np.isfinite(scale):
+        return False
+    inner = rows[:, cells]
+    known /= scale
+    try:
+        solver = _dense(inner) if len(cells) <= DENSE else _factors(inner)
+        y = solver(known)
+        y += solver(known - (y - inner @ y))
+    except (RuntimeError, Warning, MemoryError, np.linalg.LinAlgError):
+        return False
+    # An irreducible class has a nonnegative solution only if its spectral radius is below 1.
+    if not np.isfinite(y).all() or y.min() < 0 or y.max() > CEILING / scale:
+        return False
+    residual = np.abs(known + inner @ y - y)
+    if not (residual <= 1e-6 * (y + known)).all():
+        return False
+    x[cells] = scale * y
+    return True
+
+
+def _factors(inner: Any) -> Callable[[Floats], Floats]:
+    from scipy.sparse import eye_array
+    from scipy.sparse.linalg import splu
+
+    with _filtering, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solver: Callable[[Floats], Floats] = splu(
+            (eye_array(inner.shape[0], format="csr") - inner).tocsc()
+        ).solve
+    return solver
+
+
+def _dense(inner: Any) -> Callable[[Floats], Floats]:
+    system = np.eye(inner.shape[0]) - inner.toarray()
+    return lambda known: np.linalg.solve(system, known)
+
+
+@kernel(allocates=True)
+def _spread(begin, end, indices, marked):  # type: ignore[no-untyped-def]
+    """Mark everything that can reach a marked node."""
+    queue = np.flatnonzero(marked)
+    queue = np.append(queue, np.empty(len(marked) - len(queue), dtype=queue.dtype))
+    last = marked.sum()
+    at = 0
+    while at < last:
+        j = queue[at]
+        at += 1
+        for e in range(begin[j], end[j]):
+            i = indices[e]
+            if not marked[i]:
+                marked[i] = True
+                queue[last] = i
+                last += 1
+
+
+@kernel(allocates=True)
+def _topological(indptr, indices, label, count):  # type: ignore[no-untyped-def]
+    """Rank the classes so that every class comes after all it leads to (Kahn's algorithm)."""
+    waits = np.zeros(count, dtype=np.int64)
+    start = np.zeros(count + 1, dtype=np.int64)
+    for i in range(len(label)):
+        for e in range(indptr[i], indptr[i + 1]):
+            if label[i] != label[indices[e]]:
+                waits[label[i]] += 1
+                start[label[indices[e]] + 1] += 1
+    for c in range(count):
+        start[c + 1] += start[c]
+    before = np.empty(start[count], dtype=np.int64)
+    used = start[:-1].copy()
+    for i in range(len(label)):
+        for e in range(indptr[i], indptr[i + 1]):
+            c = label[indices[e]]
+            if label[i] != c:
+                before[used[c]] = label[i]
+                used[c] += 1
+    rank = np.empty(count, dtype=np.int64)
+    queue = np.empty(count, dtype=np.int64)
+    end = 0
+    for c in range(count):
+        if waits[c] == 0:
+            queue[end] = c
+            end += 1
+    for k in range(count):
+        c = queue[k]
+        rank[c] = k
+        for e in range(start[c], start[c + 1]):
+            waits[before[e]] -= 1
+            if waits[before[e]] == 0:
+                queue[end] = before[e]
+                end += 1
+    return rank
+
+
+@kernel
+def _substitute(indptr, indices, data, cells, b, x):  # type: ignore[no-untyped-def]
+    """Solve single-cell classes in order; False where staying alone already diverges."""
+    for i in cells:
+        own, known = 0.0, b[i]
+        for e in range(indptr[i], indptr[i + 1]):
+            j = indices[e]
+            if j == i:
+                own += data[e]
+            else:
+                known += data[e] * x[j]
+        if known == 0.0:
+            x[i] = 0.0
+        elif own >= 1.0 or known / (1.0 - own) > CEILING:
+            return False
+        else:
+            x[i] = known / (1.0 - own)
+    return True

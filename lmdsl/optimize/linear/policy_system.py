@@ -1,0 +1,130 @@
+"""The system of a policy, x = b + gamma P_u x: rows of the model made ready for sweeps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Pairs
+from lmdsl.machine import threads
+from lmdsl.machine.kernels import ONE, kernel
+from lmdsl.model.grid.directions import Directions
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.rows import Rows, spans
+from lmdsl.optimize.linear.gauss_seidel import NEVER, System
+
+
+class Slots:
+    """Room for the system of a policy: as the policy changes, only the rows that differ are copied.
+
+    Parameters
+    ----------
+    rows
+        The rows of all pairs.
+    room
+        Largest number of entries that the row of each cell may have, shape (n,).
+    gamma
+        Weight of the rows.
+    directions
+        Orders in which sweeps visit the cells.
+    """
+
+    def __init__(
+        self, rows: Rows, room: NDArray[np.int64], gamma: float, directions: Directions
+    ) -> None:
+        self.rows, self.gamma = rows, gamma
+        ends = np.cumsum(room)
+        count, entries = len(room), int(ends[-1]) if len(room) else 0
+        self.chosen = np.full(count, rows.count, dtype=np.uint64)  # none
+        self.held = System(
+            (ends - room).view(np.uint64),
+            np.empty(count, dtype=np.uint64),
+            np.empty(entries, dtype=np.uint32),
+            np.empty(entries),
+            np.empty(count),
+            directions,
+        )
+
+    @classmethod
+    def of(
+        cls, rows: Rows, pair_pointer: NDArray[np.int64], gamma: float, directions: Directions
+    ) -> Slots:
+        """Make room for any policy, a pair of each cell's own."""
+        room = np.empty(len(pair_pointer) - 1, dtype=np.int64)
+
+        def longest(span: tuple[int, int]) -> None:
+            _longest(*span, pair_pointer.view(np.uint64), rows.kernel[0], room)
+
+        threads.each(longest, spans(len(room)))
+        return cls(rows, room, gamma, directions)
+
+    def system(self, chosen: NDArray[np.int64]) -> System:
+        """Return gamma P for one row of each cell; it holds until the next call."""
+        now = chosen.view(np.uint64)
+
+        def fill(span: tuple[int, int]) -> None:
+            _fill(*span, now, *self.kernel)
+
+        threads.each(fill, spans(len(chosen)))
+        return self.held
+
+    @property
+    def kernel(self) -> tuple[Any, ...]:
+        """The row held of each cell, all rows, and the system, as compiled loops use them."""
+        s, columns = self.held, np.uint32(self.rows.columns)
+        return (
+            self.chosen, *self.rows.kernel, columns, self.gamma,
+            s.begin, s.end, s.indices, s.data, s.inverse,
+        )  # fmt: skip
+
+
+@kernel
+def _longest(first, last, pair_pointer, pointer, room):  # type: ignore[no-untyped-def]
+    """Find the largest number of entries among the rows of each cell."""
+    for i in range(np.uint64(first), np.uint64(last)):
+        most = np.uint64(0)
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
+            length = pointer[k + ONE] - pointer[k]
+            most = length if length > most else most
+        room[i] = most
+
+
+@kernel
+def _fill(  # type: ignore[no-untyped-def]
+    first, last, rows, before, pointer, target, code, share, columns, gamma, begin, end, indices,
+    data, inverse,
+):  # fmt: skip
+    for r in range(np.uint64(first), np.uint64(last)):
+        if rows[r] != before[r]:
+            before[r] = rows[r]
+            copy_row(
+                r, rows[r], pointer, target, code, share, columns, gamma,
+                begin, end, indices, data, inverse,
+            )  # fmt: skip
+
+
+@kernel
+def copy_row(  # type: ignore[no-untyped-def]
+    r, k, pointer, target, code, share, columns, gamma, begin, end, indices, data, inverse
+):
+    """Copy row k as row r of a system: the diagonal apart, without the attractor's share."""
+    own, used = 0.0, begin[r]
+    for e in range(pointer[k], pointer[k + ONE]):
+        j = target[e]
+        if j == r:
+            own += gamma * share[code[e]]
+        elif j < columns:
+            indices[used] = j
+            data[used] = gamma * share[code[e]]
+            used += ONE
+    inverse[r] = 1.0 / (1.0 - own) if own < 1.0 else NEVER
+    end[r] = used
+
+
+def of_policy(lp: StabilizationLP, policy: Pairs, gamma: float) -> System:
+    """Return gamma P_u for a policy, ready for sweeps."""
+    rows = lp.rows
+    room = rows.pointer[policy + 1] - rows.pointer[policy]
+    return Slots(rows, room, gamma, lp.directions).system(policy)

@@ -1,0 +1,1 @@
+"""Policies: evaluated, improved, ties broken."""

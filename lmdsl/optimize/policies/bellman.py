@@ -1,0 +1,159 @@
+"""Passes over all pairs: the Bellman operator (T V)_i = min_a gamma (P_a V)_i + G_a.
+
+One compiled loop per idea. Vectors over C carry one more entry, 0, for the attractor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Floats, Pairs
+from lmdsl.machine.kernels import ONE, kernel
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.vectors import over_cells, padded
+
+IN_PLACE = 4
+"""Ranges of a pass in which a cell sees the new values of its own range only: few, to see much."""
+
+
+@dataclass(frozen=True, eq=False)
+class Improvement:
+    """The result of one pass.
+
+    Attributes
+    ----------
+    value
+        (T V)_i, shape (n,).
+    pair
+        The first minimising column of every cell, shape (n,).
+    """
+
+    value: Floats
+    pair: Pairs
+
+
+def improve(
+    lp: StabilizationLP,
+    V: Floats,
+    gamma: float | None = None,
+    cost: Floats | None = None,
+) -> Improvement:
+    """Apply the Bellman operator to V, shape (n,).
+
+    Parameters
+    ----------
+    lp, V
+        The model and a value vector on C.
+    gamma, cost
+        Other than the LP's own; ``cost`` has shape (K,).
+    """
+    value, pair = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
+    x = padded(V)
+    gamma = lp.gamma if gamma is None else gamma
+    cost = lp.cost if cost is None else cost
+
+    def part(cells: tuple[int, int]) -> None:
+        _improve(
+            *cells, *lp.kernel,
+            cost, gamma, x, value, pair,
+        )  # fmt: skip
+
+    over_cells(lp, part)
+    return Improvement(value, pair)
+
+
+def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Improvement:
+    """Make a pass of value iteration under unit cost, cell by cell, staying put summed up at once.
+
+    From V <= T V the pass raises V, and it stays below the least unit cost.
+
+    Parameters
+    ----------
+    lp, V, gamma
+        The model, a value vector on C, and the weight.
+    backwards
+        The order in which the cells of a range are visited.
+    """
+    value, pair = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
+    x = padded(V)
+
+    def part(cells: tuple[int, int]) -> None:
+        _rise(
+            *cells, *lp.kernel,
+            gamma, x.copy(), backwards, value, pair,  # the others keep the values from before
+        )  # fmt: skip
+
+    over_cells(lp, part, IN_PLACE)
+    return Improvement(value, pair)
+
+
+def below(lp: StabilizationLP, V: Floats, limit: Floats) -> NDArray[np.bool_]:
+    """Return the columns with Q <= limit at V, shape (K,); ``limit`` has shape (n,)."""
+    found, x = np.empty(lp.K, dtype=np.bool_), padded(V)
+
+    def part(cells: tuple[int, int]) -> None:
+        _below(
+            *cells, *lp.kernel,
+            lp.cost, lp.gamma, x, limit, found,
+        )  # fmt: skip
+
+    over_cells(lp, part)
+    return found
+
+
+def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDArray[np.bool_]:
+    """Return the columns with Q <= Q_min + tolerance |Q_min|, shape (K,)."""
+    return below(lp, V, best + tolerance * np.abs(best))
+
+
+@kernel
+def _improve(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, value, pair
+):
+    for i in range(np.uint64(first), np.uint64(last)):
+        best, choice = np.inf, pair_pointer[i]
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
+            q = 0.0
+            for e in range(pointer[k], pointer[k + ONE]):
+                q += share[code[e]] * V[target[e]]
+            q = gamma * q + cost[k]
+            if q < best:
+                best, choice = q, k
+        value[i], pair[i] = best, choice
+
+
+@kernel
+def _below(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, limit, found
+):
+    for i in range(np.uint64(first), np.uint64(last)):
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
+            q = 0.0
+            for e in range(pointer[k], pointer[k + ONE]):
+                q += share[code[e]] * V[target[e]]
+            found[k] = gamma * q + cost[k] <= limit[i]
+
+
+@kernel
+def _rise(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, gamma, x, backwards, value, pair
+):
+    first, last = np.uint64(first), np.uint64(last)
+    for t in range(last - first):
+        i = last - ONE - t if backwards else first + t
+        best, choice = np.inf, pair_pointer[i]
+        for k in range(pair_pointer[i], pair_pointer[i + ONE]):
+            own, q = 0.0, 0.0
+            for e in range(pointer[k], pointer[k + ONE]):
+                q += share[code[e]] * x[target[e]]
+                own += share[code[e]] if target[e] == i else 0.0
+            q, left = 1.0 + gamma * (q - own * x[i]), 1.0 - gamma * own
+            if left > 0.0 and q < best * left:
+                best, choice = q / left, k
+        x[i] = best if best > x[i] else x[i]
+        pair[i] = choice
+    for i in range(first, last):
+        value[i] = x[i]

@@ -1,0 +1,49 @@
+"""Columns that no optimal policy uses: left out before a linear program is solved.
+
+With L <= V <= U for the optimal value V, a pair with gamma P_a L + G_a > U_i costs more than the
+optimum whatever comes after it. U is the value of a policy a few steps from the first one; L are
+value iterates from 0, which stay below V and rise. So the solver gets a smaller linear program with
+the same optimum. What it answers is certified over all pairs all the same.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lmdsl.common.types import Floats, Pairs, Stop, never
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.policies import bellman, policy
+
+STEPS, PASSES = 3, 60
+LEAST_RISE = 1e-3
+MARGIN = 1e-9
+
+
+def survivors(
+    lp: StabilizationLP, pair: Pairs, w: Floats | None = None, stop: Stop = never
+) -> Pairs:
+    """Return the columns that may belong to an optimal policy, and those of a first one, ascending.
+
+    Parameters
+    ----------
+    lp
+        The linear program.
+    pair, w
+        A gamma-stabilizing policy, a column per cell, and a proof of it where known.
+    stop
+        Asked between passes; ends the work with what is known.
+    """
+    start = policy.bound(lp, pair, w)
+    if start is None:
+        return np.arange(lp.K)
+    done = policy.iterate(lp, pair, start, stop=stop, limit=STEPS)
+    lower = np.zeros(lp.n)
+    for _ in range(PASSES):
+        higher = np.maximum(lower, bellman.improve(lp, lower).value)
+        risen = float(higher.sum() - lower.sum())
+        lower = higher
+        if stop() or risen <= LEAST_RISE * float(lower.sum()):
+            break
+    kept = bellman.below(lp, lower, done.value * (1 + MARGIN))
+    kept[done.pair] = kept[pair] = True  # the first policy leads to A from everywhere
+    return np.flatnonzero(kept)

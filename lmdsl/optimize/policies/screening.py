@@ -1,0 +1,258 @@
+"""Improvement passes that leave out cells where no other control can be better.
+
+Along a falling sequence of values V the Q of a pair falls too, but no faster than V does: if
+V' >= r V then gamma P_a V' + G_a >= r (gamma P_a V + G_a) for 0 < r <= 1, because G_a >= 0. So the
+least Q among the rivals of a cell's control, divided by the product of all ratios before it was
+found, times that of all so far, bounds them from below for ever. A cell whose value is below that
+bound needs no look at its rows. Late passes read a few numbers a cell, no rows.
+
+A bound for every pair would leave out more rows, but takes longer than it saves: a processor reads
+all rows of a cell in less time than it takes to find out which of them to read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Floats, Pairs
+from lmdsl.machine.forking import cached_property
+from lmdsl.machine.kernels import ONE, kernel
+from lmdsl.model import vectors
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.linear.policy_system import Slots, copy_row
+from lmdsl.optimize.policies import bellman
+
+LEAST_SCALE = 1e-30
+MOST = 1e308
+
+
+@dataclass(frozen=True, eq=False)
+class Pass:
+    """The outcome of one pass.
+
+    Attributes
+    ----------
+    value
+        min(V, T V) where a control changed, min(V, T_u V) elsewhere, shape (n,).
+    pair
+        The policy after the pass, shape (n,).
+    changed
+        Number of cells whose control changed.
+    looked
+        Number of rows read.
+    """
+
+    value: Floats
+    pair: Pairs
+    changed: int
+    looked: int
+
+
+class Screen:
+    """Lower bounds of the Q of the rivals of each cell's control, along a falling V.
+
+    Parameters
+    ----------
+    lp
+        The model.
+    gamma, cost
+        Other than the LP's own; ``cost`` has shape (K,).
+
+    Attributes
+    ----------
+    slots, paid
+        The rows of the policy after the last pass, copied while they are at hand, and its stage
+        costs, shape (n,).
+    """
+
+    def __init__(
+        self, lp: StabilizationLP, gamma: float | None = None, cost: Floats | None = None
+    ) -> None:
+        self.lp = lp
+        self.gamma = lp.gamma if gamma is None else gamma
+        self.cost = lp.cost if cost is None else cost
+        self.rival = np.zeros(lp.n)
+        self.paid = np.full(lp.n, np.nan)
+        self.scale = 1.0
+        self.passes = 0
+        self.pair: Pairs | None = None  # whose rivals
+
+    @cached_property
+    def slots(self) -> Slots:
+        """Room for the rows of the policy."""
+        lp = self.lp
+        return Slots.of(lp.rows, lp.pair_pointer, self.gamma, lp.directions)
+
+    def improve(self, V: Floats, pair: Pairs, margin: float) -> Pass:
+        """Change a control where another one is better by more than a relative margin.
+
+        Cells are visited forwards and backwards by turns, each with the new values of those before
+        it in the same range of cells, so that news travels far in a pass.
+
+        Parameters
+        ----------
+        V, pair
+            Values, shape (n,), and the policy, a column per cell: V >= T_u V. So a policy other
+            than that of the last pass is looked at wherever it differs, as one of its rivals.
+        margin
+            Q < Q_u - margin |Q_u| counts as better.
+        """
+        lp = self.lp
+        value, new = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
+        x, backwards = vectors.padded(V), self.passes % 2 == 1
+        self.passes += 1
+        own, slots = pair.view(np.uint64), self.slots.kernel
+
+        def part(cells: tuple[int, int]) -> tuple[int, int]:
+            changed, looked = _pass(
+                *cells, lp.kernel[0], self.cost, x.copy(), own, margin, self.scale, backwards,
+                self.rival, value, new.view(np.uint64), self.paid, *slots,
+            )  # fmt: skip
+            return int(changed), int(looked)
+
+        counts = vectors.over_cells(lp, part, bellman.IN_PLACE)
+        self.pair = new
+        return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
+
+    def tied(
+        self, V: Floats, tolerance: float, pair: Pairs
+    ) -> tuple[NDArray[np.bool_], Pairs, bool]:
+        """Find the columns with Q <= Q_min + tolerance |Q_min| at V, and those of a policy.
+
+        Parameters
+        ----------
+        V, tolerance
+            An optimal value, shape (n,), to a relative 1e-9, and what counts as equal, below 1e-7.
+        pair
+            A policy with this value, a column per cell.
+
+        Returns
+        -------
+        ties : shape (K,)
+        first : shape (n,), the first tied column of every cell
+        several : whether a cell has more than one
+        """
+        lp = self.lp
+        x, ties = vectors.padded(V), np.empty(lp.K, dtype=np.bool_)
+        first, own = np.empty(lp.n, dtype=np.int64), pair.view(np.uint64)
+        known = self.pair is not None and np.array_equal(self.pair, pair)
+        rival = self.rival if known else np.zeros(lp.n)
+        most = int(np.diff(lp.pair_pointer).max(initial=0))
+
+        def part(cells: tuple[int, int]) -> bool:
+            several = _ties(
+                *cells, *lp.kernel,
+                self.cost, self.gamma, x, tolerance, self.scale, rival, own, ties,
+                first, np.empty(most),
+            )  # fmt: skip
+            return bool(several)
+
+        return ties, first, any(vectors.over_cells(lp, part))
+
+    def follow(self, before: Floats, after: Floats) -> None:
+        """Note that V fell from ``before`` to ``after``."""
+        self.scale *= _least_ratio(before, after) * (1 - 1e-13)
+        if self.scale < LEAST_SCALE:
+            self.rival *= self.scale
+            self.scale = 1.0
+
+
+def _least_ratio(before: Floats, after: Floats) -> float:
+    """Return the smallest after / before where ``before`` is positive, at most 1."""
+    ratio = np.divide(after, before, out=np.ones(len(before)), where=before > 0)
+    return float(np.fmin.reduce(ratio, initial=1.0))
+
+
+@kernel
+def _pass(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, cost, x, pair, margin, scale, backwards, rival, value, new, paid,
+    held, pointer, target, code, share, columns, gamma, begins, ends, indices, data, inverse,
+):  # fmt: skip
+    """Improve the cells of a range in turn; ``rival`` gets the bounds of those that were read.
+
+    ``x`` is V, a copy for each range: the others keep the values from before the pass.
+
+    V_i >= Q of the cell's own pair, so where the bound of the rivals is V_i or more none is better.
+    """
+    changed, looked = 0, np.uint64(0)
+    first, last = np.uint64(first), np.uint64(last)
+    store, shrink = (1.0 - 1e-12) / scale, 1.0 / scale
+    for t in range(last - first):
+        i = last - ONE - t if backwards else first + t
+        own, begin, end = pair[i], pair_pointer[i], pair_pointer[i + ONE]
+        new[i] = own
+        if rival[i] < x[i] * shrink:
+            best, second, choice = np.inf, np.inf, own
+            for k in range(begin, end):
+                q = 0.0
+                for e in range(pointer[k], pointer[k + ONE]):
+                    q += share[code[e]] * x[target[e]]
+                q = gamma * q + cost[k]
+                # No branch for the second: processors guess it wrong, at half of the time.
+                larger = q if q > best else best
+                second = larger if larger < second else second
+                if q < best:
+                    best, choice = q, k
+            looked += end - begin
+            if choice != own:
+                own_q = 0.0  # once more: to watch out for it in the loop takes longer
+                for e in range(pointer[own], pointer[own + ONE]):
+                    own_q += share[code[e]] * x[target[e]]
+                own_q = gamma * own_q + cost[own]
+                if best < own_q - margin * abs(own_q):
+                    changed += 1
+                    new[i] = choice
+                else:
+                    second, best = best, own_q
+            if best < x[i]:
+                x[i] = best
+            rival[i] = second * store if second * store < MOST else MOST
+        if held[i] != new[i]:  # its row is at hand now
+            held[i] = new[i]
+            paid[i] = cost[new[i]]
+            copy_row(
+                i, new[i], pointer, target, code, share, columns, gamma,
+                begins, ends, indices, data, inverse,
+            )  # fmt: skip
+    for i in range(first, last):
+        value[i] = x[i]
+    return changed, looked
+
+
+@kernel
+def _ties(  # type: ignore[no-untyped-def]
+    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, tolerance, scale,
+    rival, pair, ties, chosen, q,
+):  # fmt: skip
+    """Mark the tied columns of a range of cells: first Q_min, then all that come near.
+
+    Where no rival comes near, no row is read. ``q`` is room for the pairs of a cell.
+    """
+    several = False
+    first, last = np.uint64(first), np.uint64(last)
+    for i in range(first, last):
+        begin, end = pair_pointer[i], pair_pointer[i + ONE]
+        if rival[i] * scale > V[i] * (1.0 + tolerance + 1e-9):
+            for k in range(begin, end):
+                ties[k] = k == pair[i]
+            chosen[i] = pair[i]
+            continue
+        best = np.inf
+        for k in range(begin, end):
+            q_k = 0.0
+            for e in range(pointer[k], pointer[k + ONE]):
+                q_k += share[code[e]] * V[target[e]]
+            q[k - begin] = gamma * q_k + cost[k]
+            best = q[k - begin] if q[k - begin] < best else best
+        count, chosen[i] = 0, -1
+        for k in range(begin, end):
+            ties[k] = (q[k - begin] <= best + tolerance * abs(best)) | (k == pair[i])
+            if ties[k]:
+                count += 1
+                if chosen[i] < 0:
+                    chosen[i] = k
+        several |= count > 1
+    return several

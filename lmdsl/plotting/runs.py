@@ -1,0 +1,156 @@
+"""Runs of the true map for plots: at a constant control, and in closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from lmdsl.common import inputs
+from lmdsl.common.types import Floats
+from lmdsl.control.controller import draw_starts
+from lmdsl.errors import BadInput
+from lmdsl.machine import memory
+from lmdsl.model.discretization import control_values, noise_nodes
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.problem.problem import Problem
+from lmdsl.systems.base import NamedOde, OdeSystem
+
+if TYPE_CHECKING:
+    from lmdsl.results.result import Result
+
+PIECES = 8
+"""Drawn lines of a differential equation have so many pieces a step."""
+
+Map = Callable[[Floats, Floats], Floats]
+
+
+def is_ode(problem: Problem) -> bool:
+    """Return whether states move continuously, so that runs are lines."""
+    return isinstance(problem.system, OdeSystem | NamedOde)
+
+
+def control_vector(
+    problem: Problem, control: ArrayLike | Mapping[str, float] | None
+) -> dict[str, float]:
+    """Return a control by name; None stands for the control of the grid nearest to zero."""
+    names = problem.controls
+    if control is None:
+        grid = control_values(problem)
+        return {k: float(v[np.argmin(np.abs(v))]) for k, v in zip(names, grid, strict=True)}
+    if isinstance(control, Mapping):
+        if set(control) != set(names):
+            raise BadInput(f"name every control once: {', '.join(names)}", "control")
+        control = [control[k] for k in names]
+    values = np.atleast_1d(inputs.real(control, "control"))
+    if values.shape != (len(names),) or not np.isfinite(values).all():
+        raise BadInput(f"give {len(names)} finite numbers ({', '.join(names)})", "control")
+    return dict(zip(names, map(float, values), strict=True))
+
+
+def constant_map(problem: Problem, fine: bool = False) -> Map:
+    """Return the map (x, u) -> x+ on arrays (r, d) and (r, p), noise held at its mean.
+
+    With ``fine`` the map of a differential equation covers 1/PIECES of a step.
+    """
+    system: Any = problem.system
+    if fine:
+        few = -(-system.substeps // PIECES)
+        system = system.model_copy(update={"step": system.step / PIECES, "substeps": few})
+    step = system.compile(problem.states, problem.controls, problem.noises)
+    nodes = noise_nodes(problem)
+    noise = nodes.weights @ nodes.values / nodes.weights.sum()
+
+    def image(x: Floats, u: Floats) -> Floats:
+        values: dict[str, Any] = {k: x[:, i] for i, k in enumerate(problem.states)}
+        values |= {k: u[:, i] for i, k in enumerate(problem.controls)}
+        values |= {k: np.full(len(x), v) for k, v in zip(problem.noises, noise, strict=True)}
+        with np.errstate(all="ignore"):
+            images = step(values)
+        return np.stack([np.broadcast_to(part, len(x)) for part in images], axis=-1)
+
+    return image
+
+
+def open_loop(
+    problem: Problem,
+    partition: Partition,
+    x: Floats,
+    u: Mapping[str, float],
+    steps: int,
+    fine: bool,
+) -> Floats:
+    """Return states of runs at a constant control, shape (T, r, d), NaN after leaving the box.
+
+    With ``fine`` a step makes PIECES states.
+    """
+    image = constant_map(problem, fine)
+    length = steps * (PIECES if fine else 1) + 1
+    memory.require(8 * length * x.size, "runs")
+    points = np.full((length, *x.shape), np.nan)
+    points[0] = partition.states(x)
+    active = np.arange(len(x))
+    held = np.tile(list(u.values()), (len(x), 1))
+    for n in range(len(points) - 1):
+        following = partition.states(image(points[n, active], held[active]))
+        finite = np.isfinite(following).all(axis=1)
+        points[n + 1, active[finite]] = following[finite]
+        active = active[partition.locate(list(following.T)) >= 0]
+        if not len(active):
+            break
+    return points
+
+
+def starts_of(result: Result, starts: int | ArrayLike, seed: int) -> Floats:
+    """Return so many random starts, drawn by m, or the given ones, shape (r, d)."""
+    d = result.partition.dimension
+    if isinstance(starts, int | np.integer):
+        starts = inputs.whole(starts, "starts")
+        memory.require(100 * starts * d, "runs")
+        cells = np.flatnonzero(result.weight)
+        rng = np.random.default_rng(seed)
+        return draw_starts(result.partition, cells, result.weight[cells], int(starts), rng)
+    x = inputs.states(starts, result.partition.names, "starts")
+    if x.ndim != 2 or x.shape[1] != d or not len(x):
+        raise BadInput(f"states have shape (r, {d}), not {x.shape}", "starts")
+    return x
+
+
+def closed_loop(
+    result: Result, x: Floats, steps: int, seed: int
+) -> tuple[Floats, NDArray[np.int64], int]:
+    """Run the true map under the controller until A, loss, or the step limit.
+
+    Returns
+    -------
+    points, cell, pieces
+        States, shape (T, r, d), NaN after the end of a run; the last cell of each run, -1
+        outside the box; and the number of states a step.
+    """
+    loop, problem, p = result.closed_loop, result.problem, result.partition
+    rng = np.random.default_rng(seed)
+    fine = is_ode(problem) and not problem.noises
+    inner = constant_map(problem, fine) if fine else None
+    x, cell = loop.enter(x)
+    points = [x]
+    for _ in range(steps):
+        on = np.flatnonzero((cell >= 0) & (result.cell_status[cell] == CellStatus.STABILIZED))
+        if not len(on):
+            break
+        here, state = points[-1][on], cell[on]
+        following, cell[on] = loop.step(here, state, rng)
+        u = loop.controller.at(state, here)
+        for _ in range(PIECES - 1 if inner else 0):
+            here = inner(here, u) if inner else here
+            points.append(_scatter(x, on, p.states(here)))
+        points.append(_scatter(x, on, following))
+    return np.array(points), cell, PIECES if fine else 1
+
+
+def _scatter(like: Floats, rows: NDArray[np.int64], values: Floats) -> Floats:
+    spread = np.full_like(like, np.nan)
+    spread[rows] = values
+    return spread

@@ -1,0 +1,165 @@
+"""What a plot shows of the cells: one or two axes, the others cut or projected away."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common import inputs
+from lmdsl.common.types import Bools, Floats
+from lmdsl.errors import BadInput, shown
+from lmdsl.model.grid.partition import Partition
+
+At = Mapping[str, float]
+
+
+def plain(text: str, limit: int = 60) -> str:
+    """Return user text that is safe to draw: one line, no control characters, no mathtext."""
+    spaced = "".join(" " if c.isspace() else c for c in text)
+    kept = "".join(c for c in spaced if unicodedata.category(c)[0] != "C")
+    line = " ".join(kept.split())
+    line = line if len(line) <= limit else line[: limit - 1] + "…"
+    return line.replace("$", r"\$")
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number as text, with a true minus sign."""
+    return f"{value + 0.0:.{digits}g}".replace("-", "\N{MINUS SIGN}")
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One or two axes of the partition, the others held at one cell.
+
+    Attributes
+    ----------
+    partition
+        All cells.
+    axes
+        Positions of the axes shown.
+    cell
+        Multi-index of a cell in the slice, shape (d,).
+    """
+
+    partition: Partition
+    axes: tuple[int, ...]
+    cell: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls,
+        partition: Partition,
+        attractor: Bools,
+        axes: Sequence[str] | None = None,
+        at: Mapping[str, float] | None = None,
+    ) -> View:
+        """Resolve a choice of axes; the default slice passes through the attractor's centre."""
+        names, at = partition.names, {} if at is None else at
+        inputs.kind(at, Mapping, "at", "a mapping; write {axis: value}")
+        if axes is not None:
+            inputs.kind(axes, list | tuple, "axes", "a list of axes")
+        chosen = tuple(names[:2] if axes is None else axes)
+        for name in (*chosen, *at):
+            if name not in names:
+                raise BadInput(
+                    f"{shown(name)} is not an axis; the axes are {', '.join(names)}", "axes"
+                )
+        if len(chosen) not in (1, 2) or len(set(chosen)) < len(chosen):
+            raise BadInput(f"{shown(list(chosen))}: choose one or two different axes", "axes")
+        if set(at) & set(chosen):
+            raise BadInput(f"{shown(list(at))}: only axes that are not shown are held", "at")
+        cells = np.flatnonzero(attractor)
+        centres = partition.centres(cells)
+        distance = np.abs((centres - centres.mean(axis=0)) / partition.width).sum(axis=1)
+        point = centres[np.argmin(distance)].copy()
+        for name, value in at.items():
+            point[names.index(name)] = inputs.states({name: value}, [name], "at")[..., 0]
+        inside = partition.locate([np.array([x]) for x in point], clip=False)
+        if inside[0] < 0:
+            raise BadInput(f"{shown(dict(at))} lies outside the state box", "at")
+        cell = np.array(partition.multi_index(inside))[:, 0]
+        return cls(partition, tuple(names.index(name) for name in chosen), cell)
+
+    @property
+    def hidden(self) -> tuple[int, ...]:
+        """Positions of the axes not shown."""
+        return tuple(k for k in range(self.partition.dimension) if k not in self.axes)
+
+    @property
+    def note(self) -> str:
+        """Where the slice is, such as " (z ≈ 25.5)"; empty when every axis is shown."""
+        p = self.partition
+        at = p.low + (self.cell + 0.5) * p.width
+        held = [f"{plain(p.names[k], 16)} ≈ {number(at[k])}" for k in self.hidden]
+        return f" ({', '.join(held[:4])}{', …' if len(held) > 4 else ''})" if held else ""
+
+    def label(self, k: int) -> str:
+        """Return the label of the k-th axis shown."""
+        return plain(self.partition.names[self.axes[k]], 32)
+
+    def edges(self, k: int) -> Floats:
+        """Return the edges of the cells on the k-th axis shown."""
+        p, i = self.partition, self.axes[k]
+        edges: Floats = p.low[i] + np.arange(p.cells[i] + 1) * p.width[i]
+        return edges
+
+    def ends(self, k: int) -> tuple[float, float]:
+        """Return the ends of the k-th axis shown."""
+        p, i = self.partition, self.axes[k]
+        return float(p.low[i]), float(p.high[i])
+
+    def slice(self, flat: NDArray[Any]) -> NDArray[Any]:
+        """Return values over the cells shown, indexed in the order of the axes shown."""
+        grid = flat.reshape(self.partition.shape).transpose(self.axes + self.hidden)
+        return grid[(..., *self.cell[list(self.hidden)])]
+
+    def shadow(self, mask: Bools) -> Bools:
+        """Return where any cell over the axes not shown is marked."""
+        grid = mask.reshape(self.partition.shape).transpose(self.axes + self.hidden)
+        covered: Bools = np.asarray(grid.any(axis=tuple(range(len(self.axes), grid.ndim))))
+        return covered
+
+
+def rectangles(mask: Bools, x: Floats, y: Floats) -> Floats:
+    """Return closed rectangles that cover the cells of a mask, runs along x merged, (R, 5, 2)."""
+    edge = np.diff(np.pad(mask.astype(np.int8), ((1, 1), (0, 0))), axis=0).T
+    row, first = np.nonzero(edge == 1)
+    _, last = np.nonzero(edge == -1)
+    x0, x1, y0, y1 = x[first], x[last], y[row], y[row + 1]
+    return np.stack(
+        [np.stack(c, axis=-1) for c in ((x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0))], axis=1
+    )
+
+
+def segments(points: Floats, view: View) -> tuple[Floats, NDArray[np.int64]]:
+    """Join successive states of runs by lines that break where a periodic axis wraps.
+
+    Parameters
+    ----------
+    points
+        Shape (T, r, d): r runs, NaN from where a run has ended.
+    view
+        The axes to draw.
+
+    Returns
+    -------
+    segments, run
+        Shape (S, 2, 2) and (S,). A line takes the shorter way round; across a seam it leaves on
+        one side and, as a second segment, enters on the other.
+    """
+    p, axes = view.partition, list(view.axes)
+    span = (p.high - p.low)[axes]
+    a, b = points[:-1][..., axes], points[1:][..., axes]
+    turns = np.where(p.periodic[axes], np.round((b - a) / span), 0.0)
+    step = b - a - turns * span
+    there = np.isfinite(step).all(axis=-1)
+    seam = there & (turns != 0).any(axis=-1)
+    run = np.broadcast_to(np.arange(points.shape[1]), there.shape)
+    leave = np.stack([a, a + step], axis=-2)[there]
+    enter = np.stack([b - step, b], axis=-2)[seam]
+    return np.concatenate([leave, enter]), np.concatenate([run[there], run[seam]])

@@ -1,0 +1,1 @@
+"""What a user declares: one model per key of a problem file."""

@@ -1,0 +1,378 @@
+"""Results as directories: what each file says, written and read.
+
+A directory holds problem.json, certificate.json and solution.npz; for a system written in Python
+also model.npz, the compiled rows. Arrays are accepted only with the shape and type the problem
+implies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import sys
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.certificate.claims import CLAIMS, Certificate
+from lmdsl.common import arrays
+from lmdsl.common.files import MAX_FILE_BYTES, parsed, reason
+from lmdsl.common.json_values import jsonable
+from lmdsl.control.invariance import LocalCheck
+from lmdsl.errors import BadInput, shown
+from lmdsl.machine import memory
+from lmdsl.model.discretization import control_count, control_vectors
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.problem.problem import Problem, parse_problem
+from lmdsl.results.directory import reading, writing
+from lmdsl.results.directory.reading import FORMAT, Reading
+from lmdsl.results.result import ARRAYS, EXIT, Report, Result, Seconds
+from lmdsl.systems import FunctionSystem
+from lmdsl.systems.base import NotStored
+
+SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
+TYPES = {
+    "control_index": "<i4",
+    "value": "<f8",
+    "lower": "<f8",
+    "measure": "<f8",
+    "cell_status": "|u1",
+    "witness": "<f8",
+}
+FILES = (*reading.NAMES, "figures.png")
+"""What a directory can hold of ours; the figures are written by ``plot``."""
+MODEL = ("pair_pointer", "control", "pointer", "target", "code", "cost")
+
+
+def save(result: Result, path: str | os.PathLike[str]) -> None:
+    """Write a result directory; an older one at the same place is replaced.
+
+    Raises
+    ------
+    BadInput
+        The place cannot be used, or the result does not hold what a directory needs.
+    """
+    if result.lp is None and not result.model_sha256:
+        raise BadInput("there is no model to save: " + result.message, "out")
+    writing.refuse_unless_free(path)
+    contents = _contents(result)
+    about = _certificate(result)
+    try:
+        writing.write(writing.place(path), contents, lambda keys: reading.text({**about, **keys}))
+    except OSError as error:
+        text = shown(str(path), 200)
+        raise BadInput(f"cannot write {text}: {reason(error)}", "out") from None
+
+
+def rescue(result: Result, path: str | os.PathLike[str]) -> Path | None:
+    """Write a result that could not be saved at its place to another: return where, if any."""
+    name = Path(path).name or "out"
+    for home in (tempfile.gettempdir, os.getcwd, Path.home):
+        with contextlib.suppress(OSError, RuntimeError, MemoryError, BadInput):
+            place = Path(tempfile.mkdtemp(prefix="lmdsl-", dir=home()))
+            try:
+                save(result, place / name)
+            except BaseException:
+                place.rmdir()
+                raise
+            return place / name
+    return None
+
+
+def _contents(result: Result) -> dict[str, bytes]:
+    """Return the files of a result but its certificate."""
+    problem, contents = result.problem, {}
+    if isinstance(problem.system, FunctionSystem):
+        data = _function_problem(problem)
+        if result.lp is None:
+            raise BadInput(
+                "this result of a Python function was read from a directory, which holds its "
+                "compiled rows; copy that directory"
+            )
+        contents["model.npz"] = arrays.packed(_model_arrays(result.lp))
+    else:
+        data = problem.to_dict()
+    contents["problem.json"] = reading.text(data)
+    held = {name: getattr(result, name) for name in (*ARRAYS, "witness")}
+    contents["solution.npz"] = arrays.packed(held)
+    return contents
+
+
+def _certificate(result: Result) -> dict[str, Any]:
+    proof = result.certificate
+    return {
+        "format": FORMAT,
+        **result.stored(),
+        "cause": result.cause,
+        "claims": {name: getattr(proof, name) for name in (*CLAIMS, "refusal")},
+        "measure_residual": jsonable(proof.measure_residual),
+        "reasons": list(proof.reasons),
+        "iterations": jsonable(result.iterations),
+        "gap_before_polish": jsonable(result.gap_before_polish),
+        "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
+        "versions": versions(),
+        "scope": SCOPE,
+    }
+
+
+def identity(lp: StabilizationLP) -> str:
+    """Return the digest that a certificate names: that of the compiled model.
+
+    The rows of a Python function cannot be made anew from another problem: its digest is also of
+    all that the problem says, but the name.
+    """
+    if not isinstance(lp.problem.system, FunctionSystem):
+        return lp.digest
+    said = {**_function_problem(lp.problem), "name": "", "model_sha256": lp.digest}
+    return hashlib.sha256(reading.text(said)).hexdigest()
+
+
+def _function_problem(problem: Problem) -> dict[str, Any]:
+    """Return what can be stored of the problem of a Python function."""
+    data: dict[str, Any] = problem.model_dump(mode="json", exclude_none=True)
+    return data
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that made a result."""
+    import platform
+    from importlib.metadata import version
+
+    names = ("numpy", "scipy", "numba", "pydantic")
+    from lmdsl import __version__
+
+    return {
+        "lmdsl": __version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in names},
+    }
+
+
+def _model_arrays(lp: StabilizationLP) -> dict[str, NDArray[Any]]:
+    rows = lp.rows
+    return {
+        "pair_pointer": lp.pair_pointer,
+        "control": lp.control,
+        "pointer": rows.pointer,
+        "target": rows.target,
+        "code": rows.code.astype(np.uint32),
+        "cost": lp.cost,
+    }
+
+
+# Reading ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a directory holds.
+
+    Attributes
+    ----------
+    result
+        The result, none of its claims checked.
+    certificate
+        Content of certificate.json.
+    rewritten
+        Files that are not as they were saved, and are no other save's.
+    """
+
+    result: Result
+    certificate: dict[str, Any]
+    rewritten: tuple[str, ...]
+
+
+def load(path: str | os.PathLike[str]) -> Result:
+    """Read a result directory without recompiling or checking its claims.
+
+    Raises
+    ------
+    BadInput
+        The directory is unreadable, inconsistent with its problem, or its files are of several
+        saves.
+    """
+    return read(path).result
+
+
+def read(path: str | os.PathLike[str]) -> Stored:
+    """Read a result directory, as :func:`load`, with what else it says."""
+    return reading.read(Path(path), _read)
+
+
+def read_model(
+    path: str | os.PathLike[str], result: Result, expected: Mapping[str, Any]
+) -> dict[str, NDArray[Any]]:
+    """Read arrays of model.npz, of the save that a result was read from."""
+
+    def model(files: Reading) -> dict[str, NDArray[Any]]:
+        if files.certificate.get("model_sha256") != result.model_sha256:
+            raise BadInput("another save replaced the directory; start again", "model.npz")
+        return _arrays(files, "model.npz", expected)
+
+    return reading.read(Path(path), model)
+
+
+def _arrays(files: Reading, name: str, expected: arrays.Expected) -> dict[str, NDArray[Any]]:
+    return arrays.unpacked(files.open(name, arrays.largest(expected)), name, expected)
+
+
+def _read(files: Reading) -> Stored:
+    content = files.open("problem.json", MAX_FILE_BYTES).read()
+    problem = _problem(parsed(files.folder / "problem.json", content))
+    stored = read_certificate(files.certificate)
+    partition = Partition.of(problem)
+    N = partition.size
+    M = min(control_count(problem), 10**40)
+    memory.require(64 * N + 8 * M * (2 + len(problem.control_grid)), "arrays of the result")
+    vectors = _arrays(files, "solution.npz", {name: ((N,), kind) for name, kind in TYPES.items()})
+    result = _result(problem, partition, stored, vectors)
+    return Stored(result, stored, tuple(files.rewritten))
+
+
+def _result(
+    problem: Problem, partition: Partition, stored: dict[str, Any], held: dict[str, NDArray[Any]]
+) -> Result:
+    vectors = control_vectors(problem)
+    index = held["control_index"]
+    if index.size and not (index.min() >= -1 and index.max() < len(vectors)):
+        raise BadInput("control_index holds an index outside the control grid", "solution.npz")
+    if held["cell_status"].max(initial=0) > 6:
+        raise BadInput("cell_status holds an unknown code", "solution.npz")
+    scalars = {
+        key: stored[key]
+        for key in Report.__dataclass_fields__
+        if key in stored and key not in ("seconds", "gamma_bar", "local_controller")
+    }
+    claims = stored["claims"]
+    certificate = Certificate(
+        **{name: claims.get(name) is True for name in (*CLAIMS, "refusal")},
+        contraction=stored["contraction"],
+        cost=stored["cost"],
+        lower=stored["lower_bound"],
+        gap=stored["gap"],
+        measure_residual=stored["measure_residual"],
+        tolerance=stored["tolerance"],
+        reasons=tuple(stored["reasons"]),
+    )
+    bracket = stored["gamma_bar"]
+    known: dict[str, Any] = {**scalars, **held}
+    return Result(
+        **known,
+        gamma_bar=(float(bracket[0]), float(bracket[1])) if bracket else None,
+        local_controller=_local(stored.get("local_controller")),
+        seconds=Seconds(**stored["seconds"]),
+        problem=problem,
+        partition=partition,
+        certificate=certificate,
+        control_vectors=vectors,
+        iterations=stored["iterations"],
+        gap_before_polish=stored["gap_before_polish"],
+        cause=stored["cause"],
+        model_sha256=stored["model_sha256"],
+    )
+
+
+def _local(stored: Any) -> LocalCheck | None:
+    """Read what a certificate says of the local controller; results before it say nothing."""
+    if stored is None:
+        return None
+    kinds: dict[str, Any] = {"kind": str, "cells": int, "samples": int, "kept": int}
+    kinds |= {"multiplier": _NUMBER, "proved": (int, type(None))}
+    sound = isinstance(stored, dict) and set(stored) == set(kinds)
+    if not sound or not all(
+        isinstance(stored[key], kind) and not isinstance(stored[key], bool)
+        for key, kind in kinds.items()
+    ):
+        raise BadInput("not what lmdsl writes", "certificate.json.local_controller")
+    if not _finite(stored["multiplier"]):
+        raise BadInput("multiplier is out of range", "certificate.json.local_controller")
+    return LocalCheck(**stored)
+
+
+def _problem(data: Any) -> Problem:
+    system = data.get("system") if isinstance(data, dict) else None
+    if not (isinstance(system, dict) and system.get("kind") == "function"):
+        return parse_problem(data)
+    # A function cannot be stored: everything but calling it still works.
+    stand_in = FunctionSystem(next=_not_stored, parameters=system.get("parameters", {}))
+    problem: Problem = Problem.model_validate({**data, "system": stand_in})
+    return problem
+
+
+def _not_stored(**values: Any) -> Any:
+    raise NotStored("this result came from a Python function, which a directory does not hold")
+
+
+_NUMBER = (float, int, type(None))
+_SHAPE: dict[str, Any] = {
+    "status": str,
+    "backend": (str, type(None)),
+    "solver_status": (str, type(None)),
+    "gamma": _NUMBER,
+    "cost": _NUMBER,
+    "lower_bound": _NUMBER,
+    "gap": _NUMBER,
+    "tolerance": (float, int),
+    "contraction": _NUMBER,
+    "gamma_bar": (list, type(None)),
+    "polish_steps": (int, type(None)),
+    "message": str,
+    "cause": (str, type(None)),
+    "claims": dict,
+    "measure_residual": (float, int, str, type(None)),
+    "reasons": list,
+    "iterations": (int, type(None)),
+    "gap_before_polish": _NUMBER,
+    "model_sha256": str,
+    "seconds": dict,
+    "cells": int,
+    "controls": int,
+    "pairs": int,
+    "attractor_cells": int,
+    "stabilizable_cells": int,
+}
+
+
+def _finite(value: Any) -> bool:
+    """Return whether a stored number is unknown or within the range of doubles."""
+    if value is None:
+        return True
+    if not isinstance(value, float | int) or isinstance(value, bool):
+        return False
+    return abs(value) <= sys.float_info.max
+
+
+def read_certificate(data: dict[str, Any]) -> dict[str, Any]:
+    """Check that every key of certificate.json has its type."""
+    where = reading.COMMIT
+    if data.get("format") != FORMAT:
+        raise BadInput(f"not a certificate of format {FORMAT}", where)
+    for key, kinds in _SHAPE.items():
+        if key not in data or not isinstance(data[key], kinds) or isinstance(data[key], bool):
+            raise BadInput(f"{key} is missing or of the wrong type", where)
+    for key, kinds in _SHAPE.items():
+        if kinds in (_NUMBER, (float, int)) and not _finite(data[key]):
+            raise BadInput(f"{key} is out of range", where)
+    if data["tolerance"] < 0:
+        raise BadInput("tolerance is negative", where)
+    if data["status"] not in EXIT:
+        raise BadInput(f"{shown(data['status'])} is not a status", f"{where}.status")
+    seconds = data["seconds"]
+    fields = set(Seconds.__dataclass_fields__)
+    if set(seconds) != fields or not all(_finite(v) for v in seconds.values()):
+        raise BadInput("seconds needs compile, solve and verify", where)
+    bracket = data["gamma_bar"]
+    if bracket is not None and not (
+        len(bracket) == 2 and all(x == "inf" or (x is not None and _finite(x)) for x in bracket)
+    ):
+        raise BadInput("gamma_bar is null or [low, high]", where)
+    if not all(isinstance(reason, str) for reason in data["reasons"]):
+        raise BadInput("reasons are sentences", where)
+    return data

@@ -1,0 +1,252 @@
+"""What a certificate.json says, compared with what was found anew: every number that is a claim."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.certificate.claims import CLAIMS, MEASURE_TOLERANCE, Certificate
+from lmdsl.common.json_values import jsonable
+from lmdsl.control.invariance import SAMPLES, LocalCheck
+from lmdsl.control.invariance import check as check_local
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model.assembly.sampler import Sampler
+from lmdsl.model.local_controller import LocalController
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.optimize.feasibility import gamma
+from lmdsl.results.directory.archive import SCOPE, identity
+from lmdsl.results.result import Result
+from lmdsl.systems import FunctionSystem
+
+NOT_CLAIMED = (
+    "backend", "solver_status", "tolerance", "polish_steps", "iterations", "gap_before_polish",
+    "seconds", "versions", "message", "model_sha256",
+)  # fmt: skip
+"""Keys of certificate.json that are history, wishes or text; of the digest a difference is said."""
+
+_WEAKER = {"cost": 1e-9, "lower_bound": 1e-9, "gap": 1e-3, "contraction": 1e-9}
+_ROUNDING = {
+    "cost": (1e-12, 0.0), "lower_bound": (1e-12, 0.0), "gap": (0.0, 1e-15),
+    "contraction": (0.0, 1e-15),
+}  # fmt: skip
+_BRACKET = 2e-8
+
+
+def differences(
+    whole: StabilizationLP,
+    lp: StabilizationLP,
+    result: Result,
+    certificate: dict[str, Any],
+    found: Certificate,
+) -> list[str]:
+    """Return where a certificate says something else than what was found, one sentence each.
+
+    Parameters
+    ----------
+    whole, lp
+        The recompiled model, and the part of it that a restricted result speaks of.
+    result, certificate
+        What the directory holds: the result, and all of certificate.json.
+    found
+        The claims as judged now.
+    """
+    reasons = [*_counts(lp, result), *_numbers(result, found), *_outside(lp, result)]
+    claims = certificate["claims"]
+    for name in (*CLAIMS, "refusal"):
+        if claims.get(name) is not getattr(found, name):
+            reasons.append(_differs(f"claims.{name}", claims.get(name), getattr(found, name)))
+    reasons += _residual(lp, result, certificate["measure_residual"], found)
+    if result.status == "verified" and certificate["reasons"]:
+        reasons.append("reasons are stored, but the status is verified")
+    if result.status != "not_stabilizable" and result.cause is not None:
+        reasons.append(f"cause is stored as {result.cause!r}, but nothing was refused")
+    area = result.beyond_gamma
+    beyond = jsonable(area.to_dict()) if area is not None else None
+    if "beyond_gamma" in certificate and certificate["beyond_gamma"] != beyond:
+        reasons.append("beyond_gamma is not the cells that solution.npz names")
+    if certificate.get("scope", SCOPE) != SCOPE:
+        reasons.append("scope is not what verified speaks of")
+    return reasons + _bracket(whole, result, found)
+
+
+def _differs(name: str, stored: Any, found: Any) -> str:
+    return f"{name} is stored as {stored!r}, but is {found!r}"
+
+
+def _counts(lp: StabilizationLP, result: Result) -> list[str]:
+    counts = {
+        "gamma": lp.gamma,
+        "cells": lp.partition.size,
+        "controls": len(lp.controls),
+        "pairs": lp.K,
+        "attractor_cells": int((lp.cell_status == CellStatus.ATTRACTOR).sum()),
+        "stabilizable_cells": lp.n,
+    }
+    return [
+        _differs(name, getattr(result, name), count)
+        for name, count in counts.items()
+        if getattr(result, name) != count
+    ]
+
+
+def _numbers(result: Result, found: Certificate) -> list[str]:
+    """Compare the four numbers: none may say more than is proved, nor much less."""
+    now = {
+        "cost": found.cost,
+        "lower_bound": found.lower or 0.0,
+        "gap": found.gap,
+        "contraction": found.contraction,
+    }
+    if result.status == "not_stabilizable":
+        now = dict.fromkeys(now)
+    reasons = []
+    for name, true in now.items():
+        stored = getattr(result, name)
+        if stored is None and true is None:
+            continue
+        if stored is None or true is None or not np.isfinite(stored):
+            reasons.append(_differs(name, stored, true))
+            continue
+        excess = true - stored if name == "lower_bound" else stored - true  # how much weaker
+        most = _WEAKER[name] * abs(true) + (1e-11 if name in ("gap", "contraction") else 0.0)
+        share, least = _ROUNDING[name]
+        if not -(share * abs(true) + least) <= excess <= most:
+            reasons.append(_differs(name, stored, true))
+    return reasons
+
+
+def _residual(lp: StabilizationLP, result: Result, stored: Any, found: Certificate) -> list[str]:
+    true = found.measure_residual
+    if isinstance(stored, float | int) and true is not None and np.isfinite(true):
+        with np.errstate(over="ignore", invalid="ignore"):
+            scale = max(1.0, float(result.measure[lp.cells].sum()))
+        if -1e-12 * scale <= stored - true <= MEASURE_TOLERANCE * scale and stored >= 0:
+            return []
+    elif stored == jsonable(true):
+        return []
+    return [_differs("measure_residual", stored, true)]
+
+
+def _outside(lp: StabilizationLP, result: Result) -> list[str]:
+    """Check the arrays where they say that there is nothing: off C, and after a refusal on C."""
+    attractor = lp.cell_status == CellStatus.ATTRACTOR
+    outside = lp.cell_status > CellStatus.STABILIZED
+    beyond = lp.cell_status == CellStatus.BEYOND_GAMMA
+    expected: list[tuple[str, float, float, float]] = [  # on A, off C, on C if refused
+        ("value", 0.0, np.inf, np.inf),
+        ("lower", 0.0, np.inf, 0.0),
+        ("measure", 0.0, 0.0, 0.0),
+        ("control_index", -1, -1, -1),
+    ]
+    reasons = []
+    for name, on_attractor, off, refused in expected:
+        array = getattr(result, name)
+        sound = (array[attractor] == on_attractor).all() and (array[outside] == off).all()
+        if result.status == "not_stabilizable":
+            sound = sound and (array[lp.cells] == refused).all()
+        if not sound:
+            reasons.append(f"{name} has a wrong value where there is none to give")
+    if result.witness[attractor | (outside & ~beyond)].any():
+        reasons.append("witness has a wrong value outside the stabilizable set")
+    return reasons
+
+
+def _bracket(whole: StabilizationLP, result: Result, found: Certificate) -> list[str]:
+    """Prove the stored bracket of gamma_bar again, with vectors of our own."""
+    stored = result.gamma_bar
+    if stored is None:
+        if result.cause == "gamma":
+            return ["gamma_bar is stored as null, but gamma was refused because of it"]
+        return []
+    low, high = gamma.enclosed(whole, *stored)
+    if found.refusal:
+        high = min(high, whole.gamma)
+    if 0 <= stored[0] <= low * (1 + _BRACKET) and stored[1] >= high * (1 - _BRACKET):
+        return []
+    return [f"gamma_bar is stored as {list(stored)}, but only {[low, high]} is proved"]
+
+
+# The local controller -------------------------------------------------------------------------
+
+
+def local_differences(
+    lp: StabilizationLP, result: Result, certificate: dict[str, Any], late: Deadline
+) -> list[str]:
+    """Return where the local controller does less than the directory says."""
+    stored, problem = result.local_controller, result.problem
+    if "local_controller" not in certificate:
+        return []
+    if stored is None or problem.local_controller is None:
+        if stored is None and problem.local_controller is None:
+            return []
+        word = "no" if stored is None else "a"
+        other = "one" if stored is None else "none"
+        return [f"{word} local_controller is stored, but the problem names {other}"]
+    attractor = lp.cell_status == CellStatus.ATTRACTOR
+    samples = min(max(stored.samples, 0), SAMPLES)
+    if isinstance(problem.system, FunctionSystem):  # which can be neither enclosed nor asked
+        kept = min(max(stored.kept, 0), samples)
+        cells, kind = int(attractor.sum()), problem.local_controller.kind
+        found = LocalCheck(kind, stored.multiplier, cells, None, samples, kept)
+    else:
+        local = LocalController.of(problem, lp.partition, attractor, late)
+        assert local is not None
+        found = check_local(problem, local, late, samples=samples)
+        late.check("verifying")  # it ends with less than it could have found
+    true = {
+        "kind": stored.kind == found.kind,
+        "multiplier": _close(stored.multiplier, found.multiplier),
+        "cells": stored.cells == found.cells,
+        "proved": (stored.proved or 0) <= (found.proved or 0),
+        "samples": stored.samples == found.samples,
+        "kept": stored.kept == found.kept,
+    }
+    return [
+        _differs(f"local_controller.{name}", getattr(stored, name), getattr(found, name))
+        for name, holds in true.items()
+        if not holds
+    ]
+
+
+def _close(a: float | None, b: float | None) -> bool:
+    return a == b if a is None or b is None else math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-12)
+
+
+# Python functions -----------------------------------------------------------------------------
+
+
+def function_differences(lp: StabilizationLP, result: Result) -> list[str]:
+    """Return where the saved rows of a function contradict what the file holds: sets and cost."""
+    from lmdsl.model.sets import Regions
+
+    reasons, status = [], result.cell_status
+    regions = Regions.of(result.problem, result.partition)
+    for code, mask in ((0, regions.attractor), (5, regions.avoid)):
+        if not np.array_equal(status == code, mask):
+            name = ("attractor", "avoid")[code == 5]
+            reasons.append(f"cell_status differs from the {name} of the problem")
+    cost = _costs(lp)
+    with np.errstate(invalid="ignore"):
+        wrong = ~(np.abs(lp.cost - cost) <= 1e-9 * np.abs(cost))
+    if wrong.any():
+        reasons.append(f"cost of {int(wrong.sum())} pairs is not the stage cost of the problem")
+    if result.model_sha256 not in (lp.digest, identity(lp)):  # earlier it was the first
+        reasons.append("the saved rows, or what the problem says, are not those of model_sha256")
+    return reasons
+
+
+def _costs(lp: StabilizationLP) -> NDArray[np.float64]:
+    """Return the mean stage cost of every pair, computed from the problem."""
+    sampler = Sampler(lp.problem, lp.partition)
+    table = np.empty((lp.n, len(lp.controls)))
+    for block in sampler.blocks(lp.cells):
+        mean = sampler.costs(block, sampler.values(block))
+        part = mean.T if block.cells_last else mean
+        rows = slice(block.first, block.first + len(block.cells))
+        table[rows, slice(*block.controls)] = part
+    cost: NDArray[np.float64] = table[lp.cell, lp.control]
+    return cost

@@ -1,0 +1,269 @@
+"""Saving: the files of a result directory are replaced as one, see ``folder``.
+
+Saves into one directory wait for each other where the file system knows locks. Where it does not, a
+save that finds files of two saves at its end writes its own again. Files of other names in the
+directory are never touched. A directory that is not there yet is
+made beside its place, under a hidden name, and renamed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import os
+import random
+import re
+import secrets
+import shutil
+import stat
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from lmdsl.common.files import reason, write_new
+from lmdsl.errors import BadInput, shown
+from lmdsl.results.directory.reading import (
+    COMMIT,
+    NAMES,
+    SAVE,
+    TRIES,
+    Mixture,
+    Reading,
+    read,
+    stored,
+)
+
+try:
+    import fcntl
+except ImportError:  # pragma: no cover
+    fcntl = None  # type: ignore[assignment]
+
+PATIENCE = 10.0
+"""Seconds that a save waits for another one."""
+_HIDDEN = re.compile(rf"\.({'|'.join(map(re.escape, NAMES))})\.({SAVE})")
+_LITTER = r"\.DS_Store|Thumbs\.db|desktop\.ini|lost\+found|\._.*|\.nfs.*|\.fuse_hidden.*"
+_IGNORED = re.compile(f"{_HIDDEN.pattern}|{_LITTER}")
+"""What killed saves, and systems on their own account, put into folders."""
+
+
+def place(path: str | os.PathLike[str]) -> Path:
+    """Return where a directory is or will be, links followed."""
+    return Path(os.path.realpath(path))
+
+
+def refuse_unless_free(path: str | os.PathLike[str]) -> None:
+    """Refuse a path that cannot become a result directory, before work starts.
+
+    Raises
+    ------
+    BadInput
+        The path is a file, it cannot be written, or it is a folder that holds anything and is no
+        result directory.
+    """
+    text = shown(str(path), 200)
+    try:
+        target = place(path)
+        if os.path.lexists(target) and not target.is_dir():
+            raise BadInput(f"{text} exists and is no directory; choose another name", "out")
+        if target.is_dir():
+            _refuse_foreign(target, text)
+        used = target if target.is_dir() else _existing_parent(target)
+        if not os.access(used, os.W_OK | os.X_OK):
+            raise BadInput(f"cannot write in {shown(str(used), 200)}; choose another place", "out")
+    except (OSError, ValueError) as error:
+        if isinstance(error, BadInput):
+            raise
+        raise BadInput(f"cannot use {text}: {reason(error)}", "out") from None
+
+
+def refuse_own_file(path: str | os.PathLike[str]) -> None:
+    """Refuse to write something else in place of a file of a result directory.
+
+    Raises
+    ------
+    BadInput
+        The path, links followed, is one of a result's own files.
+    """
+    target = Path(os.path.realpath(path))
+    if target.name in NAMES and _marked(target.parent):
+        raise BadInput(
+            f"{shown(str(path), 200)} is a part of the result; choose another name", "out"
+        )
+
+
+def _refuse_foreign(target: Path, text: str) -> None:
+    held = {name for name in os.listdir(target) if not _IGNORED.fullmatch(name)}
+    if held and not _marked(target):
+        raise BadInput(
+            f"{text} is not empty and not a result directory; choose another name", "out"
+        )
+    for name in held.intersection(NAMES):
+        if not stat.S_ISREG((target / name).lstat().st_mode):
+            raise BadInput(f"{name} in {text} is not a regular file; choose another name", "out")
+
+
+def _marked(target: Path) -> bool:
+    """Return whether a folder holds a certificate of ours."""
+    try:
+        return str(stored(target).get("format")).startswith("lmdsl-result/")
+    except BadInput:
+        return False
+
+
+def _existing_parent(target: Path) -> Path:
+    parent = target.parent
+    while not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir():
+        raise BadInput(f"{shown(str(parent), 200)} is not a directory", "out")
+    return parent
+
+
+# Writing ------------------------------------------------------------------------------------
+
+
+def write(
+    target: Path, files: Mapping[str, bytes], commit: Callable[[dict[str, Any]], bytes]
+) -> None:
+    """Write the files of one save; what an older save left at the same place is replaced.
+
+    Parameters
+    ----------
+    target
+        The directory, which need not exist; links followed.
+    files
+        Content of every file but certificate.json.
+    commit
+        Makes certificate.json, given the keys that join it to the other files.
+
+    Raises
+    ------
+    OSError
+        The place cannot be used; the old files are still there then.
+    """
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    target.parent.mkdir(parents=True, exist_ok=True)
+    failure: OSError | None = None
+    for attempt in range(TRIES):
+        save = secrets.token_hex(8)
+        whole = {**files, COMMIT: commit({"save": save, "files": digests})}
+        try:
+            if not target.is_dir() and _made(target, whole):
+                return
+            with _alone(target):
+                _replace(target, whole, save)
+                if _intact(target):
+                    return
+        except FileNotFoundError as error:  # another save took our files for those of a killed one
+            failure = error
+        time.sleep(random.uniform(0, 0.002 * 2 ** min(attempt, 5)))
+    raise failure or OSError(errno.EBUSY, "other saves write there at the same time")
+
+
+def _made(target: Path, files: Mapping[str, bytes]) -> bool:
+    """Make a directory that does not exist; False where another save was faster."""
+    start = f".{target.name[:40]}."
+    _tidy_beside(target, start)
+    work = target.with_name(start + secrets.token_hex(8))
+    try:
+        work.mkdir()
+        for name, content in files.items():
+            write_new(work / name, [content])
+        try:
+            os.rename(work, target)
+        except OSError:
+            if target.is_dir():
+                return False
+            raise
+    finally:
+        _remove(work)
+    return True
+
+
+def _tidy_beside(target: Path, start: str) -> None:
+    """Remove what killed saves left beside a directory that they were to make."""
+    pattern = re.compile(re.escape(start) + SAVE)
+    for name in filter(pattern.fullmatch, os.listdir(target.parent)):
+        found, gone = target.with_name(name), target.with_name(start + secrets.token_hex(8))
+        with contextlib.suppress(OSError):
+            if not found.is_symlink() and set(os.listdir(found)) <= set(NAMES):
+                # Renamed first, so that a save that lives after all finds nothing, not a part.
+                os.rename(found, gone)
+                _remove(gone)
+
+
+def _remove(work: Path) -> None:
+    """Remove a folder, also while others remove it too or a last file appears in it."""
+    for _ in range(TRIES):
+        shutil.rmtree(work, ignore_errors=True)
+        if not os.path.lexists(work):
+            return
+        time.sleep(0.001)
+
+
+@contextlib.contextmanager
+def _alone(target: Path) -> Iterator[None]:
+    """Wait for other saves, but not for ever, and not where locks are refused."""
+    descriptor, late = None, time.monotonic() + PATIENCE
+    try:
+        with contextlib.suppress(OSError, AttributeError):
+            descriptor = os.open(target, os.O_RDONLY)
+            while not _locked(descriptor) and time.monotonic() < late:
+                time.sleep(0.01)
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _locked(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _replace(target: Path, files: Mapping[str, bytes], save: str) -> None:
+    """Write files under hidden names into a directory, and rename them, certificate.json first."""
+    _tidy(target)
+    hidden = {name: target / f".{name}.{save}" for name in (COMMIT, *files)}
+    try:
+        for name, content in files.items():
+            write_new(hidden[name], [content])
+        for name, path in hidden.items():
+            os.replace(path, target / name)
+        for name in set(NAMES) - set(files):
+            with contextlib.suppress(FileNotFoundError):
+                (target / name).unlink()
+    finally:
+        _tidy(target)
+
+
+def _tidy(target: Path) -> None:
+    """Remove hidden files that the certificate in place does not name."""
+    with contextlib.suppress(OSError, BadInput):
+        kept = stored(target).get("save") if os.path.lexists(target / COMMIT) else None
+        for name in os.listdir(target):
+            found = _HIDDEN.fullmatch(name)
+            if found and found[2] != kept and not (target / name).is_dir():
+                with contextlib.suppress(OSError):  # another save removes the same
+                    os.unlink(target / name)
+
+
+def _intact(target: Path) -> bool:
+    """Return whether a directory holds the files of one save, whoever made it."""
+
+    def check(files: Reading) -> None:
+        for name in files.digests:
+            files.open(name)
+
+    try:
+        read(target, check)
+    except Mixture:
+        return False
+    except BadInput:  # written, and not to be read by us
+        return True
+    return True

@@ -1,0 +1,8 @@
+"""Files for readers that are not lmdsl: a certificate to be checked alone, and Storm's format."""
+
+from __future__ import annotations
+
+from lmdsl.results.exports.certificate import export_certificate
+from lmdsl.results.exports.drn import export_drn
+
+__all__ = ["export_certificate", "export_drn"]

@@ -1,0 +1,80 @@
+"""The finite model in the explicit format (DRN) of the probabilistic model checker Storm.
+
+State i < n is the i-th cell of C, state n the attractor. The value of a state is the least expected
+``cost`` until ``attractor`` is reached: ``R{"cost"}min=? [F "attractor"]``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from fractions import Fraction
+
+from lmdsl.common import inputs
+from lmdsl.common.files import write_whole
+from lmdsl.errors import BadInput
+from lmdsl.machine.surroundings import own_arithmetic
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.results.directory.writing import refuse_own_file
+
+
+@own_arithmetic
+def export_drn(lp: StabilizationLP, path: str | os.PathLike[str]) -> None:
+    """Write the finite model as a Markov decision process for Storm; only for gamma = 1.
+
+    Parameters
+    ----------
+    lp
+        The finite model; its gamma must be 1.
+    path
+        The file to write; it appears whole or not at all.
+
+    Notes
+    -----
+    Probabilities and costs are exact fractions. The reward model is ``cost``; the labels are
+    ``attractor`` and, on the cells where m > 0, ``init``. An action is named by the index of its
+    control.
+
+    Raises
+    ------
+    BadInput
+        Gamma is not 1, C is empty, no cell of C has m > 0, or the file cannot be written.
+    """
+    inputs.kind(lp, StabilizationLP, "lp", "a compiled LP; see lmdsl.compile")
+    if lp.gamma != 1:
+        raise BadInput(
+            f"{lp.gamma!r} is not accepted: Storm's expected total cost has no weight, so only a "
+            "problem with gamma = 1 can be exported",
+            "gamma",
+        )
+    if not lp.n:
+        raise BadInput("the stabilizable set is empty; there is no model to export")
+    if not lp.weight.any():
+        raise BadInput("no cell of `measure` is stabilizable; there is no initial state")
+    refuse_own_file(inputs.path(path))
+    write_whole(inputs.path(path), _lines(lp))
+
+
+def _lines(lp: StabilizationLP) -> Iterator[bytes]:
+    yield (
+        "// written by lmdsl\n"
+        f"// model {lp.digest}\n"
+        f"// states 0 to {lp.n - 1}: the stabilizable cells; state {lp.n}: the attractor\n"
+        "@type: MDP\n@parameters\n\n@reward_models\ncost\n"
+        f"@nr_states\n{lp.n + 1}\n@nr_choices\n{lp.K + 1}\n@model\n"
+    ).encode()
+    for i in range(lp.n):
+        text = [f"state {i} [0]{' init' if lp.weight[i] > 0 else ''}\n"]
+        for k in range(lp.pair_pointer[i], lp.pair_pointer[i + 1]):
+            text.append(f"\taction {lp.control[k]} [{Fraction(float(lp.cost[k]))}]\n")
+            text += [f"\t\t{j} : {share}\n" for j, share in _row(lp, k)]
+        yield "".join(text).encode()
+    yield f"state {lp.n} [0] attractor\n\taction stay [0]\n\t\t{lp.n} : 1\n".encode()
+
+
+def _row(lp: StabilizationLP, k: int) -> list[tuple[int, Fraction]]:
+    """Return a row as (target, probability), each target once and ascending, as Storm wants it."""
+    numerator: dict[int, int] = {}
+    for j, count in lp.rows.exact(k):
+        numerator[j] = numerator.get(j, 0) + count
+    return [(j, Fraction(numerator[j], lp.rows.shares.total)) for j in sorted(numerator)]

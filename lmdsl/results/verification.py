@@ -1,0 +1,285 @@
+"""Checking a saved result: recompile the problem, then judge every claim of the directory.
+
+Nothing in the directory is trusted: the finite model is made anew from the problem, and the stored
+vectors are checked against it by the same inequalities that certified them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from lmdsl.certificate.claims import CLAIMS, Certificate, Witness, check
+from lmdsl.certificate.exact_checks import check_exactly
+from lmdsl.common import inputs
+from lmdsl.common.json_values import jsonable
+from lmdsl.common.types import Progress
+from lmdsl.errors import BadInput
+from lmdsl.machine import memory
+from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.surroundings import own_arithmetic
+from lmdsl.model.assembly.transitions import estimate
+from lmdsl.model.discretization import noise_nodes, sample_points
+from lmdsl.model.lp import StabilizationLP, compile
+from lmdsl.model.rows import Rows, Shares
+from lmdsl.model.sets import Regions
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.optimize.feasibility.gamma import restricted
+from lmdsl.results.directory import archive
+from lmdsl.results.directory.audit import differences, function_differences, local_differences
+from lmdsl.results.result import Result
+from lmdsl.systems import FunctionSystem
+
+Judge = Callable[[StabilizationLP, Witness, float], Certificate]
+LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The outcome of :func:`verify`.
+
+    Attributes
+    ----------
+    holds
+        The status is ``verified`` or ``not_stabilizable`` and every claim holds.
+    status
+        The status the directory claims.
+    same_model
+        The recompiled model has the stored digest, bit for bit.
+    certificate
+        The claims as judged now.
+    reasons
+        What does not hold, one sentence each.
+    notes
+        What else to know, one sentence each.
+    """
+
+    holds: bool
+    status: str
+    same_model: bool
+    certificate: Certificate
+    reasons: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        proof = self.certificate
+        return {
+            "holds": self.holds,
+            "status": self.status,
+            "same_model": self.same_model,
+            "claims": {name: getattr(proof, name) for name in (*CLAIMS, "refusal")},
+            "cost": jsonable(proof.cost),
+            "lower_bound": jsonable(proof.lower),
+            "gap": jsonable(proof.gap),
+            "tolerance": jsonable(proof.tolerance),
+            "contraction": jsonable(proof.contraction),
+            "reasons": list(self.reasons),
+            "notes": list(self.notes),
+        }
+
+
+@own_arithmetic
+def verify(
+    path: str | os.PathLike[str],
+    exact: bool = False,
+    progress: Progress | None = None,
+    time_limit: float | Deadline | None = None,
+) -> Verification:
+    """Recompile the problem of a result directory and check every claim it makes.
+
+    Parameters
+    ----------
+    path
+        The result directory.
+    exact
+        Judge in rational arithmetic, without tolerance on claims 1 to 3 (slower).
+    progress
+        Called with (stage, fraction done) during long work.
+    time_limit
+        Seconds.
+
+    Raises
+    ------
+    TimeLimitReached
+        The time limit was reached.
+    BadInput
+        The directory cannot be read.
+    """
+    late = Deadline.of(time_limit)
+    in_time = partial(late.check, "verifying")
+    exactly = partial(check_exactly, check=in_time)
+    judge = exactly if inputs.flag(exact, "exact") else check
+    path = inputs.path(path)
+    held = archive.read(path)
+    result, reasons = held.result, list[str]()
+    notes = [
+        f"{name} was written anew since the save; what it holds now was judged"
+        for name in held.rewritten
+    ]
+    lp = whole = recompiled(path, result, progress, late)
+    in_time()
+    if isinstance(result.problem.system, FunctionSystem):
+        reasons += function_differences(lp, result)
+        about = "the system is a Python function, which was not re-evaluated: its saved rows"
+        notes.insert(0, f"{about} were checked")
+        if result.local_controller is not None:
+            notes.append("what the local controller does was not checked")
+        if (result.cell_status == CellStatus.BEYOND_GAMMA).any():
+            notes.append("that gamma is infeasible from the cells left out was not checked")
+    lp = _restricted(lp, result, reasons, judge)
+    same = result.model_sha256 in (lp.digest, archive.identity(lp))
+    if not same:
+        notes.append("the recompiled model differs from the stored one; claims are judged on it")
+    if not np.array_equal(lp.cell_status, result.cell_status):
+        reasons.append("cell_status differs from the recompiled model")
+    if result.status == "not_stabilizable":
+        certificate = _judge_refusal(lp, result, reasons, judge)
+    else:
+        certificate = _judge_claims(lp, result, reasons, judge)
+        if result.status != "verified":
+            reasons.append(f"the status is {result.status}, not verified")
+    reasons += differences(whole, lp, result, held.certificate, certificate)
+    in_time()
+    reasons += local_differences(lp, result, held.certificate, late)
+    return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
+
+
+def _restricted(
+    lp: StabilizationLP, result: Result, reasons: list[str], judge: Judge
+) -> StabilizationLP:
+    """Return the part of the model a restricted result speaks of, its refusal checked."""
+    beyond = result.cell_status[lp.cells] == CellStatus.BEYOND_GAMMA
+    if not beyond.any():
+        return lp
+    w = np.where(beyond, result.witness[lp.cells], 0.0)
+    if not (w[beyond] > 0).all() or not judge(lp, Witness(None, w), 0.0).refusal:
+        reasons.append("that gamma is infeasible from the cells left out is not proved")
+    return restricted(lp, w) or lp
+
+
+def recompiled(
+    path: str | os.PathLike[str],
+    result: Result,
+    progress: Progress | None = None,
+    time_limit: float | Deadline | None = None,
+) -> StabilizationLP:
+    """Return the finite model of a directory made anew; of a Python function, its saved rows."""
+    if isinstance(result.problem.system, FunctionSystem):
+        return _stored_model(path, result)
+    return compile(result.problem, progress, time_limit)
+
+
+def _judge_claims(
+    lp: StabilizationLP, result: Result, reasons: list[str], judge: Judge
+) -> Certificate:
+    pair = _policy(lp, result)
+    if pair is None:
+        reasons.append("control_index is no policy on the stabilizable set")
+    on = lp.cells
+    V_up, W = result.value[on], result.lower[on]
+    witness = Witness(pair, result.witness[on], V_up, W, result.measure[on])
+    certificate = judge(lp, witness, result.tolerance or 0.0)
+    reasons += certificate.reasons
+    return certificate
+
+
+def _judge_refusal(
+    lp: StabilizationLP, result: Result, reasons: list[str], judge: Judge
+) -> Certificate:
+    witness = Witness(None, result.witness[lp.cells])
+    certificate = judge(lp, witness, result.tolerance or 0.0)
+    proved = {
+        "empty": not lp.n,
+        "measure": bool(lp.n) and not lp.weight.any(),
+        "require_all": bool(np.isin(lp.cell_status, LOST).any()),
+        "gamma": certificate.refusal,
+    }
+    if not proved.get(result.cause or "", False):
+        reasons.append(f"the refusal ({result.cause}) is not proved by the recompiled model")
+    return certificate
+
+
+def _policy(lp: StabilizationLP, result: Result) -> np.ndarray[Any, Any] | None:
+    """Return the columns of the stored controls, None where one is no surviving pair."""
+    wanted = result.control_index[lp.cells]
+    M = len(lp.controls)
+    key = lp.cell.astype(np.int64) * M + lp.control
+    target = np.arange(lp.n, dtype=np.int64) * M + wanted
+    pair = np.minimum(np.searchsorted(key, target), max(lp.K - 1, 0))
+    if not lp.K or (wanted < 0).any() or (key[pair] != target).any():
+        return None
+    return pair
+
+
+def _stored_model(path: str | os.PathLike[str], result: Result) -> StabilizationLP:
+    """Rebuild the LP of a Python function from its saved rows."""
+    status, problem = result.cell_status, result.problem
+    regions = Regions.of(problem, result.partition)
+    cells = np.flatnonzero(status == CellStatus.STABILIZED)
+    n, K = len(cells), int(result.pairs or 0)
+    memory.require(estimate(problem), "the saved rows")
+    nodes, points = noise_nodes(problem), sample_points(problem)
+    small = archive.read_model(
+        path,
+        result,
+        {
+            "pair_pointer": ((n + 1,), "<i8"),
+            "control": ((K,), "<i4"),
+            "pointer": ((K + 1,), "<i8"),
+            "cost": ((K,), "<f8"),
+        },
+    )
+    entries = int(small["pointer"][-1])
+    if not 0 <= entries <= K * points * len(nodes.weights):
+        raise BadInput("pointer is out of range", "model.npz")
+    large = archive.read_model(
+        path, result, {"target": ((entries,), "<i4"), "code": ((entries,), "<u4")}
+    )
+    shares = Shares.of(points, nodes)
+    rows = Rows(
+        small["pointer"],
+        large["target"],
+        large["code"].astype(np.min_scalar_type(max(len(shares.numerator) - 1, 0))),
+        shares,
+        n,
+    )
+    _refuse_broken(rows, small, len(result.control_vectors))
+    return StabilizationLP(
+        problem, result.partition, result.control_vectors, status, cells,
+        small["pair_pointer"], small["control"], rows, small["cost"], problem.gamma,
+        regions.weight(cells),
+    )  # fmt: skip
+
+
+def _refuse_broken(rows: Rows, small: dict[str, Any], controls: int) -> None:
+    pairs, pointer = small["pair_pointer"], rows.pointer
+    sound = (
+        pairs[0] == 0
+        and pairs[-1] == rows.count
+        and (np.diff(pairs) > 0).all()
+        and pointer[0] == 0
+        and (np.diff(pointer) > 0).all()
+        and _increasing(small["control"], pairs)
+        and ((small["control"] >= 0) & (small["control"] < controls)).all()
+        and ((rows.target >= 0) & (rows.target <= rows.columns)).all()
+        and (rows.code < len(rows.shares.numerator)).all()
+        and (np.isfinite(small["cost"]) & (small["cost"] >= 0)).all()
+    )
+    if not sound:
+        raise BadInput("the saved rows are inconsistent", "model.npz")
+    for k in range(rows.count):
+        if sum(share for _, share in rows.exact(k)) != rows.shares.total:
+            raise BadInput(f"row {k} does not sum to 1", "model.npz")
+
+
+def _increasing(control: Any, pairs: Any) -> bool:
+    """Return whether the controls of every cell stand in order, each once."""
+    first = np.zeros(len(control), dtype=bool)
+    first[pairs[:-1]] = True
+    return bool((first[1:] | (np.diff(control) > 0)).all())
