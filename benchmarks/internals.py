@@ -16,7 +16,8 @@ from lmdsl.model.discretization import Nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.rows import Rows, Shares
 from lmdsl.optimize import witness
-from lmdsl.optimize.policies import bellman, policy
+from lmdsl.optimize.policies import bellman
+from lmdsl.optimize.policies.evaluation import evaluate
 
 
 def transitions(lp: lm.StabilizationLP) -> tuple[Any, Any, Any]:
@@ -51,7 +52,7 @@ def evaluation_sweep(lp: lm.StabilizationLP, pair: NDArray[Any]) -> Callable[[],
 
 def evaluation(lp: lm.StabilizationLP, pair: NDArray[Any]) -> Callable[[], Any]:
     """Return the whole evaluation of a policy, from nothing to its value."""
-    return lambda: policy.evaluate(lp, pair)
+    return lambda: evaluate(lp, pair)
 
 
 def certificate(lp: lm.StabilizationLP, pair: NDArray[Any], V: NDArray[Any]) -> Callable[[], Any]:

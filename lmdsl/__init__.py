@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from lmdsl import testing as testing
     from lmdsl.certificate.claims import Certificate as Certificate
     from lmdsl.control.controller import Controller as Controller
-    from lmdsl.control.controller import Simulation as Simulation
+    from lmdsl.control.simulation import Simulation as Simulation
     from lmdsl.errors import BadInput as BadInput
     from lmdsl.errors import LmdslError as LmdslError
     from lmdsl.explanation.causes import explain as explain
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from lmdsl.model.lp import StabilizationLP as StabilizationLP
     from lmdsl.model.lp import compile as compile
     from lmdsl.model.stabilizable_set import CellStatus as CellStatus
-    from lmdsl.optimize.feasibility.gamma import GammaBar as GammaBar
-    from lmdsl.optimize.feasibility.gamma import gamma_max as gamma_max
+    from lmdsl.optimize.feasibility.gamma_bar import GammaBar as GammaBar
+    from lmdsl.optimize.feasibility.gamma_bar import gamma_max as gamma_max
     from lmdsl.problem.problem import Problem as Problem
     from lmdsl.problem.problem import load as load
     from lmdsl.results.comparison import Comparison as Comparison
@@ -45,18 +45,18 @@ _HOME = {
     "Certificate": "certificate.claims",
     "Comparison": "results.comparison",
     "Controller": "control.controller",
-    "GammaBar": "optimize.feasibility.gamma",
+    "GammaBar": "optimize.feasibility.gamma_bar",
     "LmdslError": "errors",
     "Problem": "problem.problem",
     "Result": "results.result",
-    "Simulation": "control.controller",
+    "Simulation": "control.simulation",
     "StabilizationLP": "model.lp",
     "TimeLimitReached": "machine.deadline",
     "Verification": "results.verification",
     "compare": "results.comparison",
     "compile": "model.lp",
     "explain": "explanation.causes",
-    "gamma_max": "optimize.feasibility.gamma",
+    "gamma_max": "optimize.feasibility.gamma_bar",
     "load": "problem.problem",
     "solve": "results.solving",
     "verify": "results.verification",

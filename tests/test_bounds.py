@@ -10,7 +10,7 @@ from models import dense, mdp, random_lp
 from problems import made, steps
 
 import lmdsl as lm
-from lmdsl.certificate import bounds, claims, sums
+from lmdsl.certificate import bounds, checks, sums
 from lmdsl.certificate.bounds import exact_backup
 from lmdsl.optimize import descent
 
@@ -147,7 +147,7 @@ def test_too_many_open_rows_are_no_yes(monkeypatch):
 def test_the_gap_divides_by_the_upper_value():
     lp = lm.compile(made(steps()))
     V = np.ones(lp.n)
-    assert claims.gap(lp, V, V / 2) == pytest.approx(0.5)
+    assert checks.gap(lp, V, V / 2) == pytest.approx(0.5)
 
 
 def test_shares_below_the_normal_range_prove_nothing_false():
@@ -174,9 +174,9 @@ def test_shares_below_the_normal_range_prove_nothing_false():
 
 def test_underflow_before_gamma_proves_nothing_false():
     lp = mdp([[({-1: 10}, 5e-324)], [({0: 3, -1: 7}, 0.0)]], 10, 1e25)
-    assert not claims.check_upper(lp, np.array([0, 1]), np.array([5e-324, 2e-300]))
+    assert not checks.check_upper(lp, np.array([0, 1]), np.array([5e-324, 2e-300]))
     lp = mdp([[({-1: 10}, 5e-324)], [({0: 6, -1: 4}, 0.0)]], 10, 1e200)
-    assert not claims.check_lower(lp, np.array([5e-324, 4.5e-124]))
+    assert not checks.check_lower(lp, np.array([5e-324, 4.5e-124]))
 
 
 @pytest.mark.parametrize("n", [10, 1_000, 1_001, 20_000])

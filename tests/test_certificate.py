@@ -14,12 +14,13 @@ from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
 from lmdsl.certificate.bounds import exactly_below, holds_for_all
-from lmdsl.certificate.claims import CLAIMS, Witness, check
+from lmdsl.certificate.checks import check
+from lmdsl.certificate.claims import CLAIMS, Witness
 from lmdsl.certificate.exact_checks import check_exactly
 from lmdsl.model.rows import Rows
 from lmdsl.optimize import witness
 from lmdsl.optimize.feasibility import first_policy
-from lmdsl.optimize.policies import policy
+from lmdsl.optimize.policies import evaluation, iteration
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def solved():
     """The standard map on 20 x 20 cells, its witness and certificate."""
     lp = lm.compile(made(standard_map(20)))
     found = first_policy.stabilizing(lp)
-    done = policy.iterate(lp, found.pair, policy.evaluate(lp, found.pair))
+    done = iteration.iterate(lp, found.pair, evaluation.evaluate(lp, found.pair))
     verified = witness.certify(lp, done.pair, 1e-6, done.value)
     assert verified.certificate.verified
     return lp, verified.witness
@@ -147,7 +148,7 @@ def test_a_policy_that_stays_is_never_stabilizing():
     stay = lp.pair_pointer[:-1].copy()
     for w in (np.ones(lp.n), np.arange(1.0, lp.n + 1), np.full(lp.n, 1e300)):
         assert not check(lp, Witness(stay, w), 1e-6).stabilizing
-    assert policy.stability_vector(lp, stay) == (None, None)
+    assert evaluation.stability_vector(lp, stay) == (None, None)
 
 
 def test_shares_that_round_below_one_prove_nothing():
@@ -187,7 +188,7 @@ def test_claim_1_never_holds_for_an_unstable_policy(seed, gamma):
     pair = rng.integers(lp.pair_pointer[:-1], lp.pair_pointer[1:])
     g = max(gamma, 1.0)
     rho = g * max(abs(np.linalg.eigvals(dense(lp)[pair])))
-    w, _ = policy.stability_vector(lp, pair)
+    w, _ = evaluation.stability_vector(lp, pair)
     if rho >= 1 + 1e-9:
         assert w is None
         guess = np.exp(rng.normal(size=lp.n))

@@ -387,7 +387,7 @@ def test_as_a_process(tmp_path):
 
 
 def test_an_internal_error_is_one_message(capsys, file, monkeypatch):
-    import lmdsl.stabilize
+    import lmdsl.results.solving
 
     def explode(*_, **__):
         raise RuntimeError("boom\x1b[31m")
@@ -400,7 +400,7 @@ def test_an_internal_error_is_one_message(capsys, file, monkeypatch):
 
 
 def test_interrupt_is_one_message(capsys, file, monkeypatch):
-    import lmdsl.stabilize
+    import lmdsl.results.solving
 
     def interrupt(*_, **__):
         raise KeyboardInterrupt

@@ -14,7 +14,7 @@ from problems import made, steps
 import lmdsl as lm
 from lmdsl.backends import Backend, Capabilities, Solution, Stop, get, installed
 from lmdsl.backends.policy_iteration import solve as howard
-from lmdsl.optimize.policies.policy import evaluate
+from lmdsl.optimize.policies.evaluation import evaluate
 from lmdsl.testing import Check, ContractFailure, Report, check_backend, known
 from lmdsl.testing.checks import BY_HAND, CHECKS, LARGE
 from lmdsl.testing.probe import judge

@@ -7,7 +7,7 @@ import pytest
 from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl.control.controller import clopper_pearson
+from lmdsl.control.simulation import clopper_pearson
 
 
 def test_vectorised_call_wraps_and_knows_its_limits():

@@ -12,8 +12,9 @@ from problems import doubling, made, steps
 import lmdsl as lm
 from lmdsl.cli import main, solving
 from lmdsl.control import controller
-from lmdsl.control.controller import Simulation
+from lmdsl.control.simulation import Simulation
 from lmdsl.results import result
+from lmdsl.results.report import Coverage
 
 PENDULUM = {
     "format": "lmdsl/1",
@@ -151,7 +152,7 @@ def test_coverage_counts_free_cells(solve):
 def test_nearly_all_is_not_all():
     status = np.ones(100_001, dtype=np.uint8)
     status[5] = 3
-    assert str(result.Coverage.of(status)).endswith("(99.99 %)")
+    assert str(Coverage.of(status)).endswith("(99.99 %)")
 
 
 def runs(reached, lost, cycling, median=5, made=10_000, cut=False):

@@ -3,89 +3,29 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import house
 import pytest
 
 import lmdsl as lm
 
 PACKAGE = Path(lm.__file__).parent
 
-# Data flows one way: a module imports only from modules on an earlier line.
-ORDER = """
-errors frozen forking
-surroundings inputs
-kernels
-files arrays quiet
-folder
-saving
-formulas
-intervals
-jets
-program recording
-faults
-declared
-systems.base
-systems.*
-systems
-declarations
-problem
-memory threads directions deadline axis
-sampling
-apart linprog
-sweeps
-peeling merging leaps
-linear
-partition rows
-boxes lines
-regions sampler riccati
-local
-local_check
-transitions
-graph
-lp
-bellman sums
-screening rational
-bounds
-policy
-growth
-feasibility elimination
-gamma
-backends.base
-backends.scaled
-backends
-backends.*
-asking certificate
-witness
-exact
-controller
-result
-archive
-stabilize
-facts
-phase_one hints
-explanation
-stored
-comparison verification
-exports.*
-exports
-drawing drawing.view
-drawing.*
-plotting
-testing.known testing.report
-testing.probe
-testing.checks
-testing
-cli.streams
-cli.streams
-cli.output
-cli.*
-cli
-__main__
-"""
+# Data flows one way: a package imports only from packages before it, inside functions too.
+ROOMS = [
+    "errors", "machine", "common", "formulas", "systems", "problem", "model", "certificate",
+    "optimize", "backends", "control", "results", "explanation", "plotting", "testing", "cli",
+    "__main__",
+]  # fmt: skip
+
+# Imports against the order, inside functions: methods that only forward to a later package.
+FORWARDING = {("model.lp", "results.exports.mps")}
 
 PUBLIC = [
     "BadInput", "CellStatus", "Certificate", "Comparison", "Controller", "GammaBar",
@@ -94,60 +34,88 @@ PUBLIC = [
     "gamma_max", "load", "plotting", "solve", "systems", "testing", "verify",
 ]  # fmt: skip
 
-# Imports inside functions against the order, each with its reason.
-DEFERRED = {
-    ("result", "archive"),  # Result.save and Result.load are conveniences of the archive
-    ("backends", "backends.*"),  # the registry loads a backend when it is asked for
-}
+
+def test_the_rooms_are_those_of_the_plan():
+    assert {house.room(name) for name in house.modules(PACKAGE) if name} == set(ROOMS)
 
 
-def modules():
-    for path in sorted(PACKAGE.rglob("*.py")):
-        parts = path.relative_to(PACKAGE).with_suffix("").parts
-        yield ".".join(p for p in parts if p != "__init__") or "__init__", path
+def test_imports_run_one_way():
+    for (room, other), found in house.edges(PACKAGE).items():
+        for name, imported, inside in found:
+            if (name, imported) in FORWARDING:
+                assert inside, f"{name} imports {imported}: inside a function, please"
+                continue
+            assert ROOMS.index(other) < ROOMS.index(room), f"{name} imports {imported}"
 
 
-def rank(name):
-    for i, line in enumerate(ORDER.split("\n")):
-        names = line.split()
-        if name in names or (
-            "." in name and f"{name.split('.')[0]}.*" in names and name not in ORDER.split()
-        ):
-            return i
-    raise AssertionError(f"{name} has no place in the order; give it one")
+def test_every_forwarding_import_is_used():
+    known = house.modules(PACKAGE)
+    for name, imported in FORWARDING:
+        assert (imported, True) in set(house.imports(known[name], known))
 
 
-def imports(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, "absolute imports only"
-            for alias in node.names:
-                inner = f"{node.module}.{alias.name}"
-                is_module = (PACKAGE.parent / (inner.replace(".", "/") + ".py")).exists() or (
-                    PACKAGE.parent / inner.replace(".", "/") / "__init__.py"
-                ).exists()
-                yield inner if is_module else str(node.module)
+def test_no_modules_import_each_other_in_a_circle():
+    known = house.modules(PACKAGE)
+    graph = {
+        name: {other for other, inside in house.imports(path, known) if other and not inside}
+        for name, path in known.items()
+    }
+    for name in graph:  # a package's own names may come from its rooms
+        graph[name].discard(name)
+    assert house.chain(graph) is not None
 
 
-@pytest.mark.parametrize(("name", "path"), [m for m in modules() if m[0] != "__init__"])
-def test_imports_follow_the_order(name, path):
-    for imported in imports(path):
-        if imported == "lmdsl" or not imported.startswith("lmdsl."):
+def test_the_judge_knows_nothing_of_the_judged():
+    """Importing all of the certificate loads no package behind it, indirectly neither."""
+    rooms = [f"lmdsl.certificate.{path.stem}" for path in (PACKAGE / "certificate").glob("*.py")]
+    code = (
+        f"import sys, {', '.join(r for r in rooms if '__init__' not in r)}; print([*sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    for room in ROOMS[ROOMS.index("certificate") + 1 :]:
+        assert f"'lmdsl.{room}" not in done.stdout, room
+
+
+def test_no_room_takes_the_name_of_a_function():
+    """Importing a module of that name would replace the function in its package."""
+    for name, path in house.modules(PACKAGE).items():
+        if path.name != "__init__.py":
             continue
-        other = imported.removeprefix("lmdsl.")
-        if (name, other) in DEFERRED or (name, f"{other.split('.')[0]}.*") in DEFERRED:
-            continue
-        assert rank(other) < rank(name), f"{name} imports {other}"
+        package = importlib.import_module(f"lmdsl.{name}".removesuffix("."))
+        rooms = {entry.stem for entry in path.parent.iterdir() if entry.suffix in (".py", "")}
+        for room in rooms - {"__init__", "__main__"}:
+            assert not callable(vars(package).get(room)), f"{name}.{room}"
+    assert not {"check", "suggest", "study", "from_data", "from_matrices"} & {
+        path.stem for path in PACKAGE.iterdir()
+    }
+
+
+def test_the_plan_lists_every_package_with_its_sentence():
+    plan = (PACKAGE.parent / "docs/design.md").read_text()
+    table = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", plan, re.MULTILINE))
+    assert [name for name in table if name in ROOMS] == ROOMS[:-1]
+    for room in ROOMS[:-1]:
+        text = inspect.getdoc(importlib.import_module(f"lmdsl.{room}")) or ""
+        assert " ".join(text.split("\n\n")[0].split()) == table[room], room
+
+
+def test_levels_are_small():
+    levels = house.report(PACKAGE.parent)["modules a level"]
+    named = {"systems"}  # one file per named system
+    assert not {level: count for level, count in levels.items() if count > 11 and level not in
+                ({"."} | named)}  # fmt: skip
 
 
 def test_solver_libraries_are_imported_in_their_own_file_only():
-    for name, path in modules():
-        for imported in imports(path):
-            library = imported.split(".")[0]
-            if library in ("highspy", "clarabel", "cvxpy", "casadi"):
-                assert name.startswith("backends."), f"{name} imports {library}"
+    for name, path in house.modules(PACKAGE).items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                libraries = [alias.name for alias in node.names]
+            else:
+                libraries = [str(node.module)] if isinstance(node, ast.ImportFrom) else []
+            for library in libraries:
+                if library.split(".")[0] in ("highspy", "clarabel", "cvxpy", "casadi"):
+                    assert name.startswith("backends."), f"{name} imports {library}"
 
 
 def test_public_names_are_pinned():
@@ -201,10 +169,16 @@ def test_public_parameters_are_documented(name, item):
 def test_the_checker_of_certificates_stands_alone():
     script = PACKAGE.parent / "tools/check_certificate.py"
     assert len(script.read_text().splitlines()) < 200
-    for imported in imports(script):
-        assert imported.split(".")[0] in sys.stdlib_module_names
+    for node in ast.walk(ast.parse(script.read_text())):
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+        names += [str(node.module)] if isinstance(node, ast.ImportFrom) else []
+        assert {name.split(".")[0] for name in names} <= set(sys.stdlib_module_names)
 
 
 def test_no_file_is_too_long():
-    long = {name: n for name, path in modules() if (n := len(path.read_text().splitlines())) > 500}
+    long = {
+        name: n
+        for name, path in house.modules(PACKAGE).items()
+        if (n := len(path.read_text().splitlines())) > 500
+    }
     assert not long

@@ -13,7 +13,7 @@ import lmdsl as lm
 from lmdsl import backends
 from lmdsl.backends import Backend, Solution, Stop
 from lmdsl.optimize.feasibility import first_policy
-from lmdsl.optimize.policies import policy, presolve
+from lmdsl.optimize.policies import iteration, presolve
 
 
 def first(lp):
@@ -24,7 +24,7 @@ def first(lp):
 
 def optimum(lp):
     found = first(lp)
-    return policy.iterate(lp, found.pair, policy.bound(lp, found.pair, found.w)).value
+    return iteration.iterate(lp, found.pair, iteration.bound(lp, found.pair, found.w)).value
 
 
 def left_out_are_worse(lp):

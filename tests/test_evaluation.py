@@ -14,7 +14,7 @@ from lmdsl.optimize.feasibility import first_policy
 from lmdsl.optimize.linear import equations, extrapolation, gauss_seidel
 from lmdsl.optimize.linear.policy_system import of_policy
 from lmdsl.optimize.linear.substitution import Peeled
-from lmdsl.optimize.policies import policy
+from lmdsl.optimize.policies import evaluation, iteration
 from lmdsl.optimize.policies.screening import Screen
 
 
@@ -159,7 +159,7 @@ def test_a_policy_is_proved_stabilizing_where_mass_hardly_escapes(monkeypatch):
     monkeypatch.setattr(equations, "lift", lambda *a: lifted.append(lift(*a)) or lifted[-1])
     assert first_policy._proved(lp, pair, ones, types.never) is not None
     assert lifted == [True]
-    assert policy.peeled(lp, pair, 1.0).system.sweep(ones, ones.copy(), 200)[1] > 1e-3
+    assert evaluation.peeled(lp, pair, 1.0).system.sweep(ones, ones.copy(), 200)[1] > 1e-3
 
 
 @pytest.mark.parametrize("outside", [0, 30, 900])
@@ -189,7 +189,7 @@ def test_a_policy_is_proved_stabilizing_as_long_as_sweeps_gain(monkeypatch):
     monkeypatch.setattr(equations, "advance", lambda *a: calls.append(a[3]) or advance(*a))
     horizon = 4.0 * lp.tree[0].max()
     start, unit = np.full(lp.n, horizon), np.ones(lp.K)
-    done = policy.iterate(lp, lp.tree[1], start, 1 - 1 / horizon, unit, limit=6)
+    done = iteration.iterate(lp, lp.tree[1], start, 1 - 1 / horizon, unit, limit=6)
     calls.clear()
     assert first_policy._proved(lp, done.pair, done.value, types.never) is not None
     assert len(calls) > 1
@@ -200,14 +200,14 @@ def test_policies_of_mixing_models_are_the_same_with_and_without_leaps(monkeypat
     for seed in range(10):
         lp = random_lp(np.random.default_rng(seed), cells=60, controls=4, samples=3)
         pair = lp.tree[1]
-        w, _ = policy.stability_vector(lp, pair)
+        w, _ = evaluation.stability_vector(lp, pair)
         if w is None:
             continue
-        start = policy.bound(lp, pair, w)
-        done = policy.iterate(lp, pair, start)
+        start = iteration.bound(lp, pair, w)
+        done = iteration.iterate(lp, pair, start)
         with monkeypatch.context() as patch:
             patch.setattr(extrapolation, "leap", lambda *_: 1.0)
-            plain = policy.iterate(lp, pair, start)
+            plain = iteration.iterate(lp, pair, start)
         np.testing.assert_allclose(done.value, plain.value, rtol=1e-11)
         screen = Screen(lp)
         screen.slots.system(done.pair)

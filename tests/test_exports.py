@@ -16,7 +16,8 @@ from problems import doubling, made, standard_map, steps
 from random_problems import random_problem
 
 import lmdsl as lm
-from lmdsl.certificate.claims import Witness, check
+from lmdsl.certificate.checks import check
+from lmdsl.certificate.claims import Witness
 from lmdsl.certificate.exact_checks import check_exactly
 from lmdsl.cli import main
 from lmdsl.results.exports import export_certificate, export_drn

@@ -21,7 +21,8 @@ from test_properties import truly
 
 import lmdsl as lm
 from lmdsl.certificate import sums
-from lmdsl.certificate.claims import CLAIMS, Witness, check
+from lmdsl.certificate.checks import check
+from lmdsl.certificate.claims import CLAIMS, Witness
 from lmdsl.certificate.exact_checks import check_exactly
 from lmdsl.model import stabilizable_set
 from lmdsl.model.discretization import Nodes

@@ -22,8 +22,8 @@ from lmdsl.backends import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.asking import ask
 from lmdsl.cli import main
 from lmdsl.machine import surroundings
-from lmdsl.optimize.policies import policy
-from lmdsl.optimize.policies.policy import Iteration
+from lmdsl.optimize.policies import evaluation, iteration
+from lmdsl.optimize.policies.iteration import Iteration
 
 PROBLEM = standard_map(10)
 
@@ -273,8 +273,8 @@ def test_details_prove_nothing(lp, truth):
     # What our own policy iteration hands on must not be forged: here a policy that is not optimal.
     def forger(lp, options):
         pair = lp.tree[1]
-        value = policy.evaluate(lp, pair)
-        screen = policy.Screen(lp)
+        value = evaluation.evaluate(lp, pair)
+        screen = iteration.Screen(lp)
         claim = Iteration(pair, value, 0, True, screen)
         return Solution(Stop.OPTIMAL, "optimal", value, None, pair, 1, {"iteration": claim})
 

@@ -21,10 +21,10 @@ from lmdsl.common import types
 from lmdsl.model.discretization import Nodes
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.rows import Rows, Shares
-from lmdsl.optimize.feasibility import first_policy, gamma, spectral_radius
-from lmdsl.optimize.feasibility.gamma import check_high
+from lmdsl.optimize.feasibility import first_policy, gamma_bar, slowest_growth, spectral_radius
+from lmdsl.optimize.feasibility.infeasible import check_high
 from lmdsl.optimize.feasibility.spectral_radius import check_low
-from lmdsl.optimize.linear import equations
+from lmdsl.optimize.linear import classes, equations
 
 
 def chain(stays: list[int], samples: int = 10) -> lm.StabilizationLP:
@@ -68,7 +68,7 @@ def chain(stays: list[int], samples: int = 10) -> lm.StabilizationLP:
 )
 def test_reducible_structures_close_the_bracket(stays, true):
     lp = chain(stays)
-    found = gamma.bracket(lp)
+    found = gamma_bar.bracket(lp)
     assert found.low <= true * (1 + 1e-15)
     assert found.high >= true * (1 - 1e-15)
     assert found.high <= found.low * (1 + 1e-6)
@@ -89,7 +89,7 @@ def loops(n: int, stay: int = 9, samples: int = 10) -> lm.StabilizationLP:
 def test_equal_slow_classes_in_series(n):
     """The vector of low grows over up to 500 decades; high needs no growth at all."""
     lp = loops(n, 90, 100)
-    found = gamma.bracket(lp)
+    found = gamma_bar.bracket(lp)
     assert found.low <= 100 / 90 <= found.high * (1 + 1e-15)
     assert found.high <= found.low * (1 + 1e-6)
     assert found.note == ""
@@ -108,7 +108,7 @@ def test_one_class_whose_vectors_fall_over_many_decades(n, up, down):
         row = {above: up + (100 - up - down if i + 1 == n else 0), i - 1: down}
         cells.append([({**row, **({i: stay} if stay else {})}, 1.0)])
     lp = mdp(cells, 100, 1.0)
-    found = gamma.bracket(lp)
+    found = gamma_bar.bracket(lp)
     assert found.high <= found.low * (1 + 1e-6)
     P = dense(lp)
     scale = (up / down) ** (np.arange(n) / 2)  # makes all but the last row symmetric
@@ -118,7 +118,7 @@ def test_one_class_whose_vectors_fall_over_many_decades(n, up, down):
 
 
 def test_a_bracket_that_doubles_cannot_close_says_so():
-    found = gamma.bracket(loops(300, 90, 100))
+    found = gamma_bar.bracket(loops(300, 90, 100))
     assert found.low <= 100 / 90 <= found.high
     assert 1e-6 < found.high / found.low - 1 < 1e-2
     assert "leave the range of doubles" in found.note
@@ -138,7 +138,7 @@ def test_solve_around_the_limit_of_a_long_chain(g):
 
 
 def test_ended_early():
-    found = gamma.bracket(chain([9, 5]), stop=lambda: True)
+    found = gamma_bar.bracket(chain([9, 5]), stop=lambda: True)
     assert found.low <= 10 / 9
     assert found.high == np.inf
     assert found.note == "the work was ended before the bracket closed"
@@ -167,7 +167,7 @@ def test_the_width_asked_for(width):
         found = lm.gamma_max(made_lp, width=width)
         assert found.high <= found.low * (1 + width)
         assert found.note == ""
-        exact = gamma.bracket(made_lp)
+        exact = gamma_bar.bracket(made_lp)
         assert found.low <= exact.high
         assert found.high >= exact.low
         _check_vectors(made_lp, found)
@@ -188,7 +188,7 @@ def test_the_rate_of_a_large_class_needs_no_factors(shift, monkeypatch):
     weight = rng.random(4 * n) + shift
     M = sp.csr_array((weight, (np.tile(np.arange(n), 4), target)), (n, n))
     M = sp.csr_array(M / (1.1 * M.sum(axis=1).max()))
-    monkeypatch.setattr(equations, "solve_by_class", None)
+    monkeypatch.setattr(classes, "solve_by_class", None)
     x, rate, least = spectral_radius._perron(M, types.never, 0.0, Directions.line(n))
     assert (x > 0).all()
     assert least <= rate <= least * (1 + 1e-9)
@@ -200,7 +200,7 @@ def test_the_rate_of_a_large_class_needs_no_factors(shift, monkeypatch):
 @pytest.mark.parametrize(("cells", "g"), [(30, 2.2), (50, 2.4), (50, 2.5001), (50, 5), (50, 1e6)])
 def test_gamma_near_and_far_beyond_its_limit(cells, g):
     result = lm.solve(made(standard_map(cells, gamma=g)))
-    limits = gamma.bracket(lm.compile(made(standard_map(cells))))
+    limits = gamma_bar.bracket(lm.compile(made(standard_map(cells))))
     assert not limits.low <= g <= limits.high
     expected = "verified" if g < limits.low else "not_stabilizable"
     assert result.status == expected, result.message
@@ -234,7 +234,7 @@ def test_long_ways_take_few_policies(monkeypatch):
             return inner(*args)
 
         monkeypatch.setattr(module, name, counted)
-    found = gamma.bracket(lp)
+    found = gamma_bar.bracket(lp)
     assert found.high <= found.low * (1 + 1e-6)
     assert len(calls) < 90
     calls.clear()
@@ -254,7 +254,7 @@ def test_improving_a_policy_never_lowers_its_limit(seed):
     if not lp.n:
         return
     first = spectral_radius.of_policy(lp, lp.tree[1])
-    better = spectral_radius.improved(lp, first)
+    better = slowest_growth.improved(lp, first)
     assert better.limit >= first.limit * (1 - 1e-12)
     proved = spectral_radius.prove_low(lp, better)
     assert proved is not None
@@ -263,10 +263,10 @@ def test_improving_a_policy_never_lowers_its_limit(seed):
 
 def test_ended_anywhere_it_keeps_what_is_proved():
     lp = lm.compile(made(integrator(40)))
-    whole = gamma.bracket(lp)
+    whole = gamma_bar.bracket(lp)
     for most in range(0, 300, 23):
         left = iter(range(most))
-        found = gamma.bracket(lp, stop=lambda left=left: next(left, None) is None)
+        found = gamma_bar.bracket(lp, stop=lambda left=left: next(left, None) is None)
         assert found.low <= whole.high
         assert found.high >= whole.low
 
@@ -296,7 +296,7 @@ def test_against_all_policies(seed):
     if not lp.n:
         return
     _, rho = brute_force(lp)
-    found = gamma.bracket(lp)
+    found = gamma_bar.bracket(lp)
     if np.isinf(found.low):
         assert rho < 1e-4  # a nilpotent matrix; eigenvalues of one are not exactly 0 in doubles
         return
@@ -308,7 +308,7 @@ def test_against_all_policies(seed):
 
 def test_spoiled_vectors_are_refused():
     lp = chain([9, 5])
-    found = gamma.bracket(lp)
+    found = gamma_bar.bracket(lp)
     for value in (0.0, -1.0, np.nan, np.inf):
         w = found.w_low.copy()
         w[0] = value

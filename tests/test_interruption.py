@@ -20,9 +20,9 @@ from problems import made, standard_map
 
 import lmdsl as lm
 from lmdsl.machine import deadline
-from lmdsl.optimize.feasibility import first_policy, gamma
-from lmdsl.optimize.linear import equations
-from lmdsl.optimize.policies import policy
+from lmdsl.optimize.feasibility import first_policy, gamma_bar, stopping
+from lmdsl.optimize.linear import classes
+from lmdsl.optimize.policies import evaluation
 from lmdsl.results.directory import writing
 
 HERE = Path(__file__).parent
@@ -311,7 +311,7 @@ def slow(n=4):
 
 
 def test_a_time_limit_holds_within_the_sweeps_of_one_evaluation(monkeypatch):
-    monkeypatch.setattr(equations, "MAX_FACTORED", 0)  # as if the class were too large to factor
+    monkeypatch.setattr(classes, "MAX_FACTORED", 0)  # as if the class were too large to factor
     lp = slow()
     pair = np.arange(lp.n)
     asked = itertools.count()
@@ -320,13 +320,11 @@ def test_a_time_limit_holds_within_the_sweeps_of_one_evaluation(monkeypatch):
         return next(asked) >= 100
 
     with pytest.raises(deadline.Stopped):
-        policy.evaluate(lp, pair, stop=late)
+        evaluation.evaluate(lp, pair, stop=late)
     assert next(asked) < 105
     assert isinstance(first_policy.stabilizing(lp, late), first_policy.Undecided)
-    assert (
-        first_policy.optimal_stopping(lp, 1.1, np.ones(lp.n), pair, np.ones(4, bool), late) is None
-    )
-    found = gamma.bracket(lp, late)
+    assert stopping.optimal_stopping(lp, 1.1, np.ones(lp.n), pair, np.ones(4, bool), late) is None
+    found = gamma_bar.bracket(lp, late)
     assert "ended before" in found.note
     assert next(asked) < 130
     backend = lm.backends.get("policy-iteration")
@@ -334,4 +332,4 @@ def test_a_time_limit_holds_within_the_sweeps_of_one_evaluation(monkeypatch):
     assert solution.stop is lm.backends.Stop.TIME_LIMIT
     np.testing.assert_array_equal(solution.pair, pair)
     monkeypatch.undo()
-    assert policy.evaluate(lp, pair) == pytest.approx(1e4)
+    assert evaluation.evaluate(lp, pair) == pytest.approx(1e4)

@@ -9,7 +9,7 @@ from models import brute_force, dense, mdp, random_lp
 import lmdsl as lm
 from lmdsl.certificate.bounds import exactly_below
 from lmdsl.optimize.feasibility import first_policy
-from lmdsl.optimize.policies import policy
+from lmdsl.optimize.policies import evaluation, iteration, ties
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.05, 1.3, 2.0])
@@ -95,16 +95,16 @@ def test_canonical_policy_does_not_depend_on_the_start(seed):
     assert isinstance(found, first_policy.Feasible)
     ends = []
     for start in (found.pair, _random_proper(lp, rng)):
-        value = policy.evaluate(lp, start)
-        done = policy.iterate(lp, start, value)
-        ends.append(policy.canonical(lp, done.pair, done.value))
+        value = evaluation.evaluate(lp, start)
+        done = iteration.iterate(lp, start, value)
+        ends.append(ties.canonical(lp, done.pair, done.value))
     np.testing.assert_array_equal(ends[0], ends[1])
 
 
 def _random_proper(lp, rng):
     for _ in range(200):
         pair = rng.integers(lp.pair_pointer[:-1], lp.pair_pointer[1:])
-        if policy.evaluate(lp, pair, 1.0, np.ones(lp.K)) is not None:
+        if evaluation.evaluate(lp, pair, 1.0, np.ones(lp.K)) is not None:
             return pair
     return lp.tree[1]
 
@@ -190,7 +190,7 @@ def test_free_cells_of_a_small_core_are_worth_exactly_nothing():
     lp = mdp([*way, *pays, *free], 10, 1.0)
     unpaid = np.r_[0:56, 58:60]
     start = lp.pair_pointer[1:] - 1  # every cell its last control: more than one step to go
-    done = policy.iterate(lp, start, policy.bound(lp, start))
+    done = iteration.iterate(lp, start, iteration.bound(lp, start))
     assert done.steps > 1
     np.testing.assert_array_equal(done.value[unpaid], 0.0)
     answers = [lm.solve(lp, backend) for backend in ("policy-iteration", "highs:simplex")]

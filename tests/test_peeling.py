@@ -18,7 +18,7 @@ from scipy.sparse.linalg import splu, spsolve
 
 from lmdsl.machine import threads
 from lmdsl.model import rows
-from lmdsl.optimize.linear import equations, substitution
+from lmdsl.optimize.linear import classes, equations, substitution
 from lmdsl.optimize.linear.gauss_seidel import System
 from lmdsl.optimize.linear.policy_system import Slots
 from lmdsl.optimize.linear.substitution import Peeled
@@ -182,7 +182,7 @@ def test_well_mixed_systems_are_solved_without_factors(monkeypatch, zeros, scale
     if zeros:
         b[100:] = 0.0
     exact = spsolve(sp.eye_array(1200, format="csc") - M.tocsc(), b)
-    monkeypatch.setattr(equations, "solve_by_class", lambda *_: pytest.fail("it was factored"))
+    monkeypatch.setattr(classes, "solve_by_class", lambda *_: pytest.fail("it was factored"))
     np.testing.assert_allclose(equations.solve(M, b), exact, rtol=1e-9)
     mu = equations.solve_transposed(Peeled.of(System.of(M)), b, lambda: M)
     np.testing.assert_allclose(mu - M.T @ mu, b, atol=1e-11 * mu.max())
@@ -200,7 +200,7 @@ def test_factors_in_several_threads_leave_the_filters_of_warnings_alone(monkeypa
         warnings.simplefilter("default")
         before = list(warnings.filters)
         with ThreadPoolExecutor(3) as pool:
-            list(pool.map(lambda _: equations._factors(M), range(3)))
+            list(pool.map(lambda _: classes._factors(M), range(3)))
         assert list(warnings.filters) == before
 
 

@@ -18,7 +18,8 @@ from hypothesis import strategies as st
 from models import mdp, random_lp
 
 import lmdsl as lm
-from lmdsl.certificate.claims import Witness, check
+from lmdsl.certificate.checks import check
+from lmdsl.certificate.claims import Witness
 from lmdsl.certificate.exact_checks import check_exactly
 
 SAMPLES = 6

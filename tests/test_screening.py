@@ -12,8 +12,9 @@ from problems import made, standard_map
 import lmdsl as lm
 from lmdsl.model import vectors
 from lmdsl.optimize.feasibility import first_policy
-from lmdsl.optimize.policies import bellman, policy
+from lmdsl.optimize.policies import bellman, iteration
 from lmdsl.optimize.policies.screening import Screen
+from lmdsl.optimize.policies.ties import first_column
 
 MARGIN = 1e-12
 
@@ -65,7 +66,7 @@ def begun(lp):
     found = first_policy.stabilizing(lp)
     if not isinstance(found, first_policy.Feasible):
         return None
-    return found.pair, policy.bound(lp, found.pair, found.w)
+    return found.pair, iteration.bound(lp, found.pair, found.w)
 
 
 @pytest.mark.parametrize("ranges", [1, 3])
@@ -101,14 +102,14 @@ def test_ties_are_those_of_a_pass_over_all_rows():
     for lp in (*models(), *paths()):
         if (start := begun(lp)) is None:
             continue
-        done = policy.iterate(lp, *start)
+        done = iteration.iterate(lp, *start)
         Q = lp.gamma * (lp.rows.matrix() @ done.value) + lp.cost
         least = np.minimum.reduceat(Q, lp.pair_pointer[:-1])[lp.cell]
         expected = (least * (1 + MARGIN) >= Q) | (np.arange(lp.K) == done.pair[lp.cell])
         for screen in (done.screen, Screen(lp)):
             ties, first, more = screen.tied(done.value, MARGIN, done.pair)
             np.testing.assert_array_equal(ties, expected)
-            np.testing.assert_array_equal(first, policy.first_column(lp, expected))
+            np.testing.assert_array_equal(first, first_column(lp, expected))
             assert more == (ties.sum() > lp.n)
         several += more
     assert several

@@ -11,7 +11,7 @@ from lmdsl.common import types
 from lmdsl.optimize.feasibility import first_policy
 from lmdsl.optimize.linear import equations, gauss_seidel
 from lmdsl.optimize.linear.substitution import Peeled
-from lmdsl.optimize.policies import policy
+from lmdsl.optimize.policies import iteration
 
 
 def killed(kill, cost="1", gamma=1.0, cells=40):
@@ -43,8 +43,8 @@ def test_where_all_runs_last_as_long_the_first_bound_is_the_value(kill, gamma):
     """No step is made for differences that are rounding."""
     lp = lm.compile(made(killed(kill, gamma=gamma)))
     first = first_policy.stabilizing(lp)
-    start = policy.bound(lp, first.pair, first.w)
-    done = policy.iterate(lp, first.pair, start)
+    start = iteration.bound(lp, first.pair, first.w)
+    done = iteration.iterate(lp, first.pair, start)
     np.testing.assert_allclose(start, 1 / (1 - gamma * (1 - kill)), rtol=1e-8)
     assert done.steps <= 1
     result = lm.solve(lp)
@@ -53,9 +53,9 @@ def test_where_all_runs_last_as_long_the_first_bound_is_the_value(kill, gamma):
 
 def test_a_constant_is_no_bound_where_costs_or_losses_differ():
     lp = lm.compile(made(killed(0.01, cost="1 + x")))
-    assert policy._even(lp, lp.tree[1], 1.0, lp.cost[lp.tree[1]]) is None
+    assert iteration._even(lp, lp.tree[1], 1.0, lp.cost[lp.tree[1]]) is None
     lp = lm.compile(made(standard_map(10)))
-    assert policy._even(lp, lp.tree[1], 1.0, np.ones(lp.n)) is None
+    assert iteration._even(lp, lp.tree[1], 1.0, np.ones(lp.n)) is None
 
 
 @pytest.mark.parametrize("escape", [1e-1, 1e-3, 1e-6])
@@ -84,7 +84,7 @@ def test_descending_refuses_what_has_no_solution():
 @pytest.mark.parametrize("patience", [0, 10**9])
 def test_the_optimum_is_the_same_however_policies_are_evaluated(patience, monkeypatch):
     lp = lm.compile(made(killed(0.001, cost="1 + 10*(x - 0.3)**2 + y")))
-    monkeypatch.setattr(policy, "PATIENCE", patience)
+    monkeypatch.setattr(iteration, "PATIENCE", patience)
     result = lm.solve(lp)
     assert result.status == "verified", result.message
     assert result.gap < 1e-10

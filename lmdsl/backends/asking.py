@@ -25,7 +25,8 @@ from lmdsl.machine import quiet
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.surroundings import restore_rounding
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.optimize.policies import policy, presolve
+from lmdsl.optimize.policies import presolve
+from lmdsl.optimize.policies.iteration import Iteration
 
 MOST_ITERATIONS = 2**53
 """A larger number of iterations is no count, and no number that JSON keeps."""
@@ -33,7 +34,7 @@ MOST_ITERATIONS = 2**53
 
 def ask(
     lp: StabilizationLP, backend: Backend, options: Options
-) -> tuple[Solution, policy.Iteration | None, str]:
+) -> tuple[Solution, Iteration | None, str]:
     """Ask a backend; whatever it raises, returns or prints, a well-formed solution comes out.
 
     Returns
@@ -62,7 +63,7 @@ def ask(
 
 def _ask(
     lp: StabilizationLP, backend: Backend, options: Options
-) -> tuple[Solution, policy.Iteration | None]:
+) -> tuple[Solution, Iteration | None]:
     asked, kept = lp, None
     own, process = backends.ours(backend), os.getpid()
     try:

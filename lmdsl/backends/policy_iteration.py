@@ -13,7 +13,7 @@ from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility import first_policy
-from lmdsl.optimize.policies import policy
+from lmdsl.optimize.policies import evaluation, iteration
 
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:
@@ -34,14 +34,14 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
             return Solution(stop, stop.name.lower())
         pair, w = found.pair, found.w
     try:
-        value = policy.bound(lp, pair, w)
+        value = iteration.bound(lp, pair, w)
         if value is None:
-            value = policy.evaluate(lp, pair, stop=late)
+            value = evaluation.evaluate(lp, pair, stop=late)
     except Stopped:
         return Solution(Stop.TIME_LIMIT, "time_limit", pair=pair)
     if value is None:
         return Solution(Stop.FAILED, "some cell costs more than 1e305; divide stage_cost")
-    done = policy.iterate(lp, pair, value, stop=late, limit=options.max_iterations)
+    done = iteration.iterate(lp, pair, value, stop=late, limit=options.max_iterations)
     stop = Stop.OPTIMAL
     if not done.converged:
         stop = Stop.TIME_LIMIT if late() else Stop.ITERATION_LIMIT

@@ -5,15 +5,14 @@ from __future__ import annotations
 from fractions import Fraction
 
 from lmdsl.certificate import exact_sums
-from lmdsl.certificate.claims import (
-    Certificate,
-    Witness,
+from lmdsl.certificate.checks import (
     allowed_residual,
     explained,
     is_policy,
     is_sound,
     with_stated_gap,
 )
+from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.certificate.sums import LARGEST, rounded_down, rounded_up
 from lmdsl.common.types import Check
 from lmdsl.model.lp import StabilizationLP

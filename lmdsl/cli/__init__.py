@@ -59,7 +59,7 @@ def _fail(message: str, status: int) -> int:
 
 def _bad(parsed: Arguments, message: str, status: str = "bad_input", exit_status: int = 2) -> int:
     if getattr(parsed, "json", False):
-        from lmdsl.results.result import Report
+        from lmdsl.results.report import Report
 
         report: dict[str, Any] = Report(status=status, message=message).to_dict()
         if parsed.command == "compare":

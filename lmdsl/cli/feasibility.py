@@ -25,7 +25,7 @@ def add(command: Command) -> None:
 
 
 def _gamma_max(parsed: Arguments) -> int:
-    from lmdsl.optimize.feasibility.gamma import gamma_max
+    from lmdsl.optimize.feasibility.gamma_bar import gamma_max
     from lmdsl.problem.problem import load
 
     problem = load(parsed.file)

@@ -17,8 +17,8 @@ the number of brackets, calls, signs and powers that stand inside one another: `
 depth 0, ``sin((-x))`` depth 3. A flat chain of ``+ -`` or ``* /`` adds none, however long.
 
 `parse` turns a text into a `Formula`, a flat list of steps, operands before their users.
-`lmdsl.formulas.program.Program` joins formulas, merges equal steps and evaluates them on arrays. Nothing is
-reordered or simplified, save that a power with the constant exponent 2 is a square.
+`lmdsl.formulas.program.Program` joins formulas, merges equal steps and evaluates them on arrays.
+Nothing is reordered or simplified, save that a power with the constant exponent 2 is a square.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model import riccati
 from lmdsl.model.discretization import Nodes, control_range, noise_nodes
 from lmdsl.model.grid.partition import Partition
-from lmdsl.problem.declarations import ConstantControl, LinearFeedback, LqrFeedback
+from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
 from lmdsl.problem.problem import Problem
 
 MAX_RICCATI = 256  # states of the Riccati equation: orbit points times axes

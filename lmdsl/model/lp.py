@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common import inputs
-from lmdsl.common.files import write_whole
 from lmdsl.common.frozen import Frozen, freeze
 from lmdsl.common.types import Floats, Progress
 from lmdsl.errors import BadInput
@@ -249,23 +248,9 @@ class StabilizationLP(Frozen):
 
         Row ``d<cell>`` is the balance of a cell, column ``t<cell>_<control>`` its occupation.
         """
-        if not self.n:
-            raise BadInput("the stabilizable set is empty; there is no LP to write")
-        A = self.A
-        lines = ["NAME lmdsl", "ROWS", " N cost", *(f" E d{i}" for i in self.cells), "COLUMNS"]
-        names = [f"d{i}" for i in self.cells]
-        cell = self.cells[self.cell]
-        for k in range(self.K):
-            column = f" t{cell[k]}_{self.control[k]}"
-            lines.append(f"{column} cost {float(self.cost[k])!r}")
-            span = slice(A.indptr[k], A.indptr[k + 1])
-            lines += [
-                f"{column} {names[i]} {float(v)!r}"
-                for i, v in zip(A.indices[span], A.data[span], strict=True)
-            ]
-        lines.append("RHS")
-        lines += [f" m {names[i]} {float(self.b[i])!r}" for i in np.flatnonzero(self.b)]
-        write_whole(inputs.path(path), ("\n".join([*lines, "ENDATA"]) + "\n").encode())
+        from lmdsl.results.exports.mps import export_mps
+
+        export_mps(self, inputs.path(path))
 
     def __repr__(self) -> str:
         return (

@@ -11,11 +11,9 @@ from typing import Any
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.certificate.claims import (
+from lmdsl.certificate.checks import (
     MANY,
     MEASURE_TOLERANCE,
-    Verified,
-    Witness,
     check,
     check_lower,
     check_measure,
@@ -23,6 +21,7 @@ from lmdsl.certificate.claims import (
     gap,
     weighted,
 )
+from lmdsl.certificate.claims import Verified, Witness
 from lmdsl.common.types import Floats, Pairs, Stop, never
 from lmdsl.machine import threads
 from lmdsl.machine.deadline import Stopped
@@ -30,7 +29,7 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize import descent
 from lmdsl.optimize.linear import equations
 from lmdsl.optimize.linear.substitution import Peeled
-from lmdsl.optimize.policies import policy
+from lmdsl.optimize.policies import evaluation, iteration
 
 MOST_GUESSED = 1e-7
 
@@ -58,7 +57,7 @@ def certify(
     tolerance
         Largest gap that counts as verified.
     value
-        The policy's value as :func:`lmdsl.optimize.policies.policy.evaluate` gives it; made where missing.
+        The policy's value as :func:`~evaluation.evaluate` gives it; made where missing.
     stop
         Ends the work; what is not established by then is not claimed.
     """
@@ -78,14 +77,14 @@ def _first_try(
 ) -> tuple[Witness, Floats | None]:
     """Return vectors that serve as a rule, and the policy's value."""
     under, own = lp.under(pair), np.arange(lp.n)
-    rows = policy.peeled(under, own, lp.gamma)
+    rows = evaluation.peeled(under, own, lp.gamma)
     growing = rows if lp.growth == lp.gamma else None
 
     def bounds_of_cost() -> tuple[Witness, Floats | None]:
-        w, d = policy.stability_vector(under, own, sharp=True, stop=stop, rows=growing)
+        w, d = evaluation.stability_vector(under, own, sharp=True, stop=stop, rows=growing)
         V = value
         if V is None:
-            V = policy.evaluate(under, own, transient=w is not None, stop=stop, rows=rows)
+            V = evaluation.evaluate(under, own, transient=w is not None, stop=stop, rows=rows)
         if V is None:
             return Witness(pair, w, None, lower_vector(lp, None, tolerance, stop), None), None
         return Witness(pair, w, upper_vector(under, own, V, w, d), _guessed(under, V, tolerance)), V
@@ -124,7 +123,7 @@ def _tightened(
 
 
 def _upper_with_slack(lp: StabilizationLP, pair: Pairs, slack: float, stop: Stop) -> Floats | None:
-    V = policy.evaluate(lp, pair, lp.gamma * (1 + slack), stop=stop)
+    V = evaluation.evaluate(lp, pair, lp.gamma * (1 + slack), stop=stop)
     return V if V is not None and check_upper(lp, pair, V) else None
 
 
@@ -132,10 +131,10 @@ def _lower_with_slack(
     lp: StabilizationLP, pair: Pairs, V: Floats, slack: float, stop: Stop
 ) -> Floats | None:
     gamma = lp.gamma * (1 - slack)
-    value = policy.evaluate(lp, pair, gamma, start=V, stop=stop)
+    value = evaluation.evaluate(lp, pair, gamma, start=V, stop=stop)
     if value is None:
         return None
-    W = policy.iterate(lp, pair, value, gamma, stop=stop, limit=20).value
+    W = iteration.iterate(lp, pair, value, gamma, stop=stop, limit=20).value
     return W if check_lower(lp, W) else None
 
 

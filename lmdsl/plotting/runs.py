@@ -10,14 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from lmdsl.common import inputs
 from lmdsl.common.types import Floats
-from lmdsl.control.controller import draw_starts
+from lmdsl.control.simulation import draw_starts
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.model.discretization import control_values, noise_nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
-from lmdsl.systems.base import NamedOde, OdeSystem
+from lmdsl.systems.base import OdeSystem
+from lmdsl.systems.named import NamedOde
 
 if TYPE_CHECKING:
     from lmdsl.results.result import Result

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
-from pydantic.json_schema import GenerateJsonSchema
 
 from lmdsl.common import inputs
 from lmdsl.common.files import read_json, write_whole
@@ -20,28 +19,14 @@ from lmdsl.common.strict_model import Declared, Positive
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.language import Formula, parse
 from lmdsl.formulas.names import FormulaText
-from lmdsl.problem.declarations import (
-    Attractor,
-    Avoid,
-    Axis,
-    ConstantControl,
-    ControlGrid,
-    ControlRange,
-    ControlValues,
-    Grid,
-    LinearFeedback,
-    LocalUnion,
-    LqrFeedback,
-    Measure,
-    Noise,
-    NoiseNormal,
-    NoiseValues,
-    Random,
-    SamplingUnion,
-    Sobol,
-    StateBox,
-    SystemUnion,
-)
+from lmdsl.problem.axes import Axis, StateBox
+from lmdsl.problem.controls import ControlGrid, ControlRange, ControlValues
+from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LocalUnion, LqrFeedback
+from lmdsl.problem.noise import Noise, NoiseNormal, NoiseValues
+from lmdsl.problem.sampling import Grid, Random, SamplingUnion, Sobol
+from lmdsl.problem.schema import FileSchema
+from lmdsl.problem.sets import Attractor, Avoid, Measure
+from lmdsl.problem.system_kinds import SystemUnion
 from lmdsl.systems import FunctionSystem, System
 
 __all__ = [
@@ -64,19 +49,6 @@ __all__ = [
     "load",
     "parse_problem",
 ]
-
-
-class _FileSchema(GenerateJsonSchema):
-    """The schema of what a file may hold: no null."""
-
-    def nullable_schema(self, schema: Any) -> Any:
-        return self.generate_inner(schema["schema"])
-
-    def default_schema(self, schema: Any) -> Any:
-        generated = super().default_schema(schema)
-        if generated.get("default", 0) is None:
-            del generated["default"]
-        return generated
 
 
 class Problem(Declared):
@@ -148,7 +120,7 @@ class Problem(Declared):
     def model_json_schema(cls, *args: Any, **options: Any) -> dict[str, Any]:
         """Return the JSON Schema of a problem file; see pydantic for the options."""
         if len(args) < 3:  # the third is the generator
-            options = {"schema_generator": _FileSchema, **options}
+            options = {"schema_generator": FileSchema, **options}
         return super().model_json_schema(*args, **options)
 
     @classmethod

@@ -17,8 +17,9 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.optimize.policies import bellman
 from lmdsl.problem.problem import Problem
+from lmdsl.results.job import not_compiled
 from lmdsl.results.result import Result
-from lmdsl.results.solving import TOLERANCE, not_compiled, solve
+from lmdsl.results.solving import TOLERANCE, solve
 
 BACKENDS = ("policy-iteration", "highs", "clarabel", "cvxpy")
 """Compared where none is named: those that every installation has."""

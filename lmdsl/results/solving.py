@@ -4,37 +4,29 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl import backends
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.asking import ask
-from lmdsl.certificate import claims
-from lmdsl.certificate.claims import Certificate, Verified, Witness
+from lmdsl.certificate import checks
+from lmdsl.certificate.claims import Verified, Witness
 from lmdsl.common import inputs
-from lmdsl.common.types import Pairs, Progress
-from lmdsl.control.invariance import check
+from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, shown
-from lmdsl.machine.deadline import Deadline, Stopped, TimeLimitReached
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.model.discretization import control_count, control_vectors
-from lmdsl.model.grid.partition import Partition
-from lmdsl.model.local_controller import LocalController
 from lmdsl.model.lp import StabilizationLP, compile
-from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.optimize.feasibility import first_policy, gamma
-from lmdsl.optimize.policies import bellman, policy
+from lmdsl.optimize.feasibility import first_policy, gamma_bar, restriction
 from lmdsl.optimize.witness import certify
 from lmdsl.problem.problem import Problem
-from lmdsl.results.result import Coverage, Result, Seconds
+from lmdsl.results.job import _Job, not_compiled
+from lmdsl.results.polishing import _polish
+from lmdsl.results.result import Result
 
 TOLERANCE = 1e-6
-UNKNOWN = 255
-"""Status of cells of which nothing is known."""
 
 
 @own_arithmetic
@@ -110,7 +102,7 @@ def solve(
         verified = _refuse(lp, first, tolerance)
         w = verified.witness.w
         if verified.certificate.refusal and w is not None:
-            smaller = gamma.restricted(lp, w) if restrict_to_gamma else None
+            smaller = restriction.restricted(lp, w) if restrict_to_gamma else None
             if smaller is not None:
                 inner = solve(
                     smaller,
@@ -124,9 +116,9 @@ def solve(
                 )
                 return job.restricted(inner, lp.expand(w, 0.0, 0.0))
             job.solve_seconds, job.finish = time.perf_counter() - started, late.again()
-            limits = gamma.bracket(lp, late, start=first.best)
+            limits = gamma_bar.bracket(lp, late, start=first.best)
             bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
-            message = gamma.refusal_message(lp, w, limits, bracket)
+            message = restriction.refusal_message(lp, w, limits, bracket)
             return job.refused("gamma", message, verified, bracket)
         first = first_policy.Undecided(first.best.pair, first.lower)
     options = Options(
@@ -158,37 +150,6 @@ def solve(
     job.verify_seconds = time.perf_counter() - started
     undecided = isinstance(first, first_policy.Undecided) and not late()
     return job.solved(solution, outcome, verified, undecided)
-
-
-def not_compiled(
-    backend: str | Backend, problem: Problem, tolerance: float, error: Exception, seconds: float
-) -> Result:
-    """Return what is known of a problem that there was no time to compile."""
-    partition = Partition.of(problem)
-    N = partition.size
-    message = str(error)
-    claims = Certificate(*(False,) * 5, *(None,) * 5, tolerance=tolerance, reasons=(message,))
-    return Result(
-        status="solver_failed",
-        backend=backend if isinstance(backend, str) else backend.name,
-        solver_status="time limit",
-        gamma=problem.gamma,
-        tolerance=tolerance,
-        cells=N,
-        controls=control_count(problem),
-        seconds=Seconds(compile=seconds),
-        message=message,
-        problem=problem,
-        partition=partition,
-        certificate=claims,
-        control_index=np.full(N, -1, dtype=np.int32),
-        value=np.full(N, np.inf),
-        lower=np.zeros(N),
-        measure=np.zeros(N),
-        cell_status=np.full(N, UNKNOWN, dtype=np.uint8),
-        witness=np.zeros(N),
-        control_vectors=control_vectors(problem),
-    )
 
 
 def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:
@@ -226,211 +187,4 @@ def _refuse(lp: StabilizationLP, found: first_policy.Refused, tolerance: float) 
 
     w = lower_until_below(lp, found.w, lp.gamma, None)
     witness = Witness(None, found.w if w is None else w)
-    return Verified(claims.check(lp, witness, tolerance), witness)
-
-
-@dataclass(frozen=True, eq=False)
-class _Outcome:
-    """A policy after polishing, and what polishing did."""
-
-    pair: Pairs
-    value: NDArray[np.float64] | None
-    steps: int
-    gap_before: float | None
-
-
-def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
-    """Return the policy of a solution: its own, else greedy in V, else largest occupation."""
-    if solution.pair is not None:
-        return solution.pair
-    if solution.value is not None:
-        return bellman.improve(lp, np.maximum(solution.value, 0.0)).pair
-    if solution.occupation is not None:
-        theta = solution.occupation
-        top = np.maximum.reduceat(theta, lp.pair_pointer[:-1])
-        return policy.first_column(lp, theta >= top[lp.cell])
-    return None
-
-
-def _polish(
-    lp: StabilizationLP,
-    solution: Solution,
-    iteration: policy.Iteration | None,
-    start: Pairs,
-    tolerance: float,
-    stop: Deadline,
-) -> _Outcome:
-    """Improve a backend's policy exactly until nothing is strictly better, then break ties.
-
-    A policy that is not g-stabilizing is discarded where gamma >= 1. After a limit the policy is
-    left as it is: a limit is not a license to go on.
-    """
-    if iteration is not None and solution.stop.success:  # it ends where polishing would begin
-        return _tidied(lp, iteration, tolerance, 0, None, stop)
-    pair = _claimed(lp, solution)
-    if pair is not None and not _usable(lp, pair, solution.value):
-        pair = None
-    if pair is None:
-        pair = start
-    guess = None if solution.pair is None else solution.value
-    try:
-        value = policy.evaluate(lp, pair, start=guess, transient=lp.gamma >= 1, stop=stop.again())
-    except Stopped:
-        value = None
-    if value is None or solution.stop.limit:
-        return _Outcome(pair, value, 0, None)
-    done = policy.iterate(lp, pair, value, stop=stop)
-    gap_before = None
-    if done.steps:
-        gap_before = certify(lp, pair, tolerance, value, stop.again()).certificate.gap
-    return _tidied(lp, done, tolerance, done.steps, gap_before, stop)
-
-
-def _tidied(
-    lp: StabilizationLP,
-    done: policy.Iteration,
-    tolerance: float,
-    steps: int,
-    gap_before: float | None,
-    stop: Deadline,
-) -> _Outcome:
-    """Break ties; where that costs more than the tolerance the strict minimisers stay."""
-    try:
-        tidy = policy.canonical(lp, done.pair, done.value, done.screen, stop)
-    except Stopped:
-        tidy = done.pair
-    if (tidy != done.pair).any() and _usable(lp, tidy, done.value):
-        tidy_value = policy.evaluate(lp, tidy, start=done.value, transient=lp.gamma >= 1)
-        limit = (1 + tolerance / 4) * claims.weighted(lp, done.value)
-        if tidy_value is not None and claims.weighted(lp, tidy_value) <= limit:
-            return _Outcome(tidy, tidy_value, steps, gap_before)
-    value = done.value if done.converged else None  # else perhaps only a bound of it
-    return _Outcome(done.pair, value, steps, gap_before)
-
-
-def _usable(lp: StabilizationLP, pair: Pairs, guess: NDArray[np.float64] | None) -> bool:
-    return lp.gamma < 1 or policy.stability_vector(lp, pair, guess)[0] is not None
-
-
-class _Job:
-    """What is known before a result exists; makes the result."""
-
-    def __init__(
-        self,
-        lp: StabilizationLP,
-        backend: Backend,
-        tolerance: float,
-        compile_seconds: float | None,
-        spec: str | None,
-    ) -> None:
-        self.lp, self.tolerance, self.compile_seconds = lp, tolerance, compile_seconds
-        self.backend = spec or backend.name
-        self.finish = Deadline()
-        self.solve_seconds: float | None = None
-        self.verify_seconds: float | None = None
-        self.log = ""
-
-    def refused(
-        self,
-        cause: str,
-        message: str,
-        verified: Verified | None = None,
-        gamma_bar: tuple[float, float] | None = None,
-    ) -> Result:
-        if verified is None:
-            witness = Witness(None)
-            verified = Verified(claims.check(self.lp, witness, self.tolerance), witness)
-        proof = replace(verified.certificate, reasons=(message,))
-        return self._result(
-            verified.witness, proof, "not_stabilizable", message, cause=cause, gamma_bar=gamma_bar
-        )
-
-    def restricted(self, inner: Result, w: NDArray[np.float64]) -> Result:
-        """Add to the result on the feasible cells the proof that the others are infeasible."""
-        count = int((w > 0).sum())
-        return replace(
-            inner,
-            witness=inner.witness + w,
-            seconds=replace(inner.seconds, compile=self.compile_seconds),
-            message=f"{inner.message}; {count} cells are proved infeasible at this gamma",
-        )
-
-    def solved(
-        self, solution: Solution, outcome: _Outcome, verified: Verified, undecided: bool
-    ) -> Result:
-        proof = verified.certificate
-        if proof.verified:
-            status = "verified"
-            free = Coverage.of(self.lp.cell_status).free
-            message = (
-                f"the controller brings every one of {self.lp.n} cells (of {free} free) to the "
-                f"attractor; its cost is within {proof.gap:.2g} of optimal (finite model)"
-            )
-        else:
-            failed = not solution.stop.success and not undecided
-            status = "solver_failed" if failed else "unverified"
-            message = "; ".join(proof.reasons)
-            if failed:
-                message = f"{solution.stop.value} ({solution.word}); {message}"
-            elif undecided:
-                message = (
-                    f"gamma = {self.lp.gamma!r} is so close to its limit, or the way to the "
-                    f"attractor so long, that the numbers decide neither way; {message}"
-                )
-        return self._result(
-            verified.witness,
-            proof,
-            status,
-            message,
-            solver_status=solution.word,
-            polish_steps=outcome.steps,
-            gap_before_polish=outcome.gap_before,
-            iterations=solution.iterations,
-            log=self.log,
-        )
-
-    def _result(
-        self, witness: Witness, proof: Certificate, status: str, message: str, **more: Any
-    ) -> Result:
-        lp, n = self.lp, self.lp.n
-
-        def spread(values: Any, missing: float, attractor: float, outside: float) -> Any:
-            known = np.full(n, missing) if values is None else values
-            return lp.expand(np.asarray(known, dtype=np.float64), attractor, outside)
-
-        index = np.full(lp.partition.size, -1, dtype=np.int32)
-        if witness.pair is not None:
-            index[lp.cells] = lp.control[witness.pair]
-        solved = status != "not_stabilizable"
-        attractor = lp.cell_status == CellStatus.ATTRACTOR
-        local = LocalController.of(lp.problem, lp.partition, attractor)
-        return Result(
-            status=status,
-            backend=self.backend,
-            gamma=lp.gamma,
-            cost=proof.cost if solved else None,
-            lower_bound=(proof.lower or 0.0) if solved else None,
-            gap=proof.gap if solved else None,
-            tolerance=self.tolerance,
-            contraction=proof.contraction,
-            cells=lp.partition.size,
-            controls=len(lp.controls),
-            pairs=lp.K,
-            attractor_cells=int(attractor.sum()),
-            stabilizable_cells=n,
-            local_controller=None if local is None else check(lp.problem, local, self.finish),
-            seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
-            message=message,
-            problem=lp.problem,
-            partition=lp.partition,
-            certificate=proof,
-            control_index=index,
-            value=spread(witness.V_up if proof.upper_bound else None, np.inf, 0.0, np.inf),
-            lower=spread(witness.W if proof.lower_bound else None, 0.0, 0.0, np.inf),
-            measure=spread(witness.mu, 0.0, 0.0, 0.0),
-            cell_status=lp.cell_status,
-            witness=spread(witness.w, 0.0, 0.0, 0.0),
-            control_vectors=lp.controls,
-            lp=lp,
-            **more,
-        )
+    return Verified(checks.check(lp, witness, tolerance), witness)

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.certificate.claims import CLAIMS, Certificate, Witness, check
+from lmdsl.certificate.checks import check
+from lmdsl.certificate.claims import CLAIMS, Certificate, Witness
 from lmdsl.certificate.exact_checks import check_exactly
 from lmdsl.common import inputs
 from lmdsl.common.json_values import jsonable
@@ -29,7 +30,7 @@ from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.rows import Rows, Shares
 from lmdsl.model.sets import Regions
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.optimize.feasibility.gamma import restricted
+from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory import archive
 from lmdsl.results.directory.audit import differences, function_differences, local_differences
 from lmdsl.results.result import Result

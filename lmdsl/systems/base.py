@@ -8,20 +8,19 @@ simulation, plots) treats them alike. Every right-hand side sees the old values.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field
 
 from lmdsl.common.strict_model import Declared, Positive, plain
 from lmdsl.common.types import Check
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.enclosures import Jet
-from lmdsl.formulas.language import FORMULA_CONSTANTS, FORMULA_FUNCTIONS, Formula, parse
+from lmdsl.formulas.language import Formula, parse
 from lmdsl.formulas.names import Formulas, Parameters
 from lmdsl.formulas.program import Program
 from lmdsl.formulas.tracing import Recorder
@@ -195,97 +194,3 @@ class _RungeKutta:
                 for x, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
             )
         return state
-
-
-class NamedSystem(System):
-    """A system known by name: its formulas are fixed, its parameters have defaults.
-
-    A subclass sets ``defaults`` (parameter values), ``source`` (a citation), ``summary`` (one
-    line) and ``problem`` (the problem file that ``lmdsl init NAME`` writes).
-    """
-
-    kind: str
-    defaults: ClassVar[Mapping[str, float]] = {}
-    source: ClassVar[str] = ""
-    summary: ClassVar[str] = ""
-    problem: ClassVar[Mapping[str, Any]] = {}
-
-    @model_validator(mode="after")
-    def _known_parameters(self) -> NamedSystem:
-        for name in self.parameters:
-            if name not in self.defaults:
-                known = ", ".join(self.defaults) or "none"
-                raise BadInput(
-                    f"{shown(name)} is not a parameter of {self.kind}; its parameters: {known}",
-                    "parameters",
-                )
-        return self
-
-    formulas: ClassVar[Mapping[str, str]] = {}
-
-    def constants(self) -> Mapping[str, float]:
-        """Return the values of all parameters, defaults included."""
-        return {**self.defaults, **self.parameters}
-
-    @classmethod
-    def controls(cls) -> tuple[str, ...]:
-        """Return the names of the controls in the formulas, sorted."""
-        found = set(re.findall(r"[A-Za-z_]\w*", " ".join(cls.formulas.values())))
-        known = {*FORMULA_FUNCTIONS, *FORMULA_CONSTANTS, *cls.defaults, *cls.formulas}
-        return tuple(sorted(found - known))
-
-    def definition(self) -> MapSystem | OdeSystem:
-        """Return the same system with its formulas written out."""
-        raise NotImplementedError
-
-    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
-        """See :meth:`System.compile`."""
-        if set(states) != set(self.formulas):
-            raise BadInput(
-                f"{self.kind} has the states {', '.join(self.formulas)}; declare these axes",
-                "state_box",
-            )
-        for control in self.controls():
-            if control not in controls and control not in noise:
-                raise BadInput(
-                    f"{self.kind} has the control {control}; declare it, for example "
-                    f'"{control}": {{"values": [0]}}',
-                    "control_grid",
-                )
-        return self.definition().compile(states, controls, noise)
-
-
-class NamedMap(NamedSystem):
-    """A named discrete-time map; a subclass sets ``formulas``."""
-
-    def definition(self) -> MapSystem:
-        """See :meth:`NamedSystem.definition`."""
-        return MapSystem(parameters=dict(self.constants()), next=dict(self.formulas))
-
-
-class NamedOde(NamedSystem):
-    """A named differential equation; a subclass sets ``formulas`` and defaults for the step.
-
-    Attributes
-    ----------
-    step
-        Sampling time in seconds (or in the time unit of the equations).
-    substeps
-        RK4 steps per sampling time.
-    """
-
-    step: Positive = 0.1
-    substeps: Substeps = 1
-
-    def definition(self) -> OdeSystem:
-        """See :meth:`NamedSystem.definition`."""
-        return OdeSystem(
-            parameters=dict(self.constants()),
-            derivative=dict(self.formulas),
-            step=self.step,
-            substeps=self.substeps,
-        )
-
-
-class NotStored(BadInput):
-    """A Python function was called of which only a saved result is at hand."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from lmdsl.systems.base import NamedMap
+from lmdsl.systems.named import NamedMap
 
 
 class DoubleIntegrator(NamedMap):

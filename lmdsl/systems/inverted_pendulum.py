@@ -6,7 +6,8 @@ from math import pi
 from typing import ClassVar, Literal
 
 from lmdsl.common.strict_model import Positive
-from lmdsl.systems.base import NamedOde, Substeps
+from lmdsl.systems.base import Substeps
+from lmdsl.systems.named import NamedOde
 
 
 class InvertedPendulum(NamedOde):

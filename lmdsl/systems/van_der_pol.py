@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from lmdsl.common.strict_model import Positive
-from lmdsl.systems.base import NamedOde, Substeps
+from lmdsl.systems.base import Substeps
+from lmdsl.systems.named import NamedOde
 
 
 class VanDerPol(NamedOde):

@@ -275,7 +275,7 @@ def _load(flat, at, step, line):  # type: ignore[no-untyped-def]
 
 @kernel
 def _locate(image, axis, clip, index):  # type: ignore[no-untyped-def]
-    """Add the indices on one axis; ``axis`` has the fields of :class:`lmdsl.model.grid.partition.Axis`."""
+    """Add the indices on one axis; ``axis`` has the fields of :class:`Axis`."""
     low, high, width, cells, stride = axis[0], axis[1], axis[2], axis[3], axis[4]
     if axis[5] > 0.0:
         circle(image, low, high, width, cells, stride, index)

@@ -9,20 +9,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Bools, Floats, Pairs, Stop, never
+from lmdsl.common.types import Floats, Pairs, Stop, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.optimize.feasibility import spectral_radius
+from lmdsl.optimize.feasibility import slowest_growth, spectral_radius
+from lmdsl.optimize.feasibility.stopping import optimal_stopping
 from lmdsl.optimize.linear import equations
 from lmdsl.optimize.linear.gauss_seidel import TOLERANCE
 from lmdsl.optimize.policies import bellman
-from lmdsl.optimize.policies.policy import iterate, peeled, stability_vector
+from lmdsl.optimize.policies.evaluation import peeled, stability_vector
+from lmdsl.optimize.policies.iteration import iterate
 
 SWEEPS, MOST_ROUNDS = 30, 8
 """Sweeps after which a proof is given up unless they moved it much less than the ones before."""
 
-LEAST_UNIT = 1e-140
-"""Least unit of a component: quotients of two stay within doubles."""
 
 NEAR = 64
 """Largest level up to which a few passes from the levels may make a stabilizing policy."""
@@ -172,7 +172,7 @@ def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
     Then the last policy is stabilizing at gamma', and as a rule at gamma too. Else w is the proof
     against gamma; the slack absorbs rounding.
     """
-    best = spectral_radius.improved(lp, spectral_radius.short_lived(lp, stop), stop, lp.gamma)
+    best = slowest_growth.improved(lp, spectral_radius.short_lived(lp, stop), stop, lp.gamma)
     for slack in (1e-6, 1e-9, 1e-12, 0.0):
         if best.limit > lp.gamma:
             w, _ = stability_vector(lp, best.pair, stop=stop)
@@ -193,131 +193,3 @@ def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
             better = spectral_radius.of_policy(lp, found.pair, stop)
             best = better if better.limit > best.limit else best
     return Undecided(best.pair, 0.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Stopping:
-    """The outcome of optimal stopping.
-
-    Attributes
-    ----------
-    w
-        The greatest solution of w = min(reward, gamma min_a P_a w), shape (n,).
-    pair
-        A column for every cell; it counts where ``going``.
-    going
-        Cells that do not stop.
-    converged
-        False where rounding or the limit ended the work.
-    """
-
-    w: Floats
-    pair: Pairs
-    going: Bools
-    converged: bool
-
-    @property
-    def refuses(self) -> bool:
-        """True when w is not 0."""
-        return float(self.w.max(initial=0.0)) > 1e-9
-
-    @property
-    def carried(self) -> Floats:
-        """Return w without the cells at rounding level: their own rows then ask 0 <= something."""
-        return np.where(self.w > 1e-14 * self.w.max(initial=0.0), self.w, 0.0)
-
-
-def optimal_stopping(
-    lp: StabilizationLP,
-    gamma: float,
-    reward: Floats,
-    pair: Pairs | None = None,
-    going: Bools | None = None,
-    stop: Stop = never,
-    limit: int = 1000,
-) -> Stopping | None:
-    """Stop in a cell for ``reward``, or go on under the least favourable control, for ever.
-
-    Howard's policy iteration with "stop" as one more control, as :func:`iterate` makes it. Every
-    policy stays transient under gamma P, so a policy that ends with every cell going and w = 0
-    is gamma-stabilizing.
-
-    Parameters
-    ----------
-    lp, gamma
-        The model and the weight.
-    reward
-        Shape (n,), >= 0.
-    pair, going
-        A first policy, transient under gamma P on the cells that go; default: stop everywhere.
-    stop, limit
-        End the work, with None; largest number of steps.
-    """
-    pair = lp.pair_pointer[:-1].copy() if pair is None else pair
-    going = np.zeros(lp.n, dtype=np.bool_) if going is None else going
-    try:
-        return _stopping(lp, gamma, reward, pair, going, stop, limit)
-    except Stopped:
-        return None
-
-
-def _stopping(
-    lp: StabilizationLP,
-    gamma: float,
-    reward: Floats,
-    pair: Pairs,
-    going: Bools,
-    stop: Stop,
-    limit: int,
-) -> Stopping:
-    zero = np.zeros(lp.K)
-    w = _stopped(lp, gamma, reward, pair, going, reward, stop)
-    if w is None:
-        going = np.zeros(lp.n, dtype=np.bool_)
-        w = reward
-    for step in range(limit):
-        if stop():
-            raise Stopped
-        lowered, new_pair, new_going = w, pair, going
-        for _ in range(step + 1):
-            better = bellman.improve(lp, lowered, gamma, zero)
-            least = np.minimum(better.value, reward)
-            same = np.where(better.value <= reward, new_going & (better.pair == new_pair), False)
-            change = (least < lowered * (1 - 1e-13)) & ~same
-            if not change.any():
-                break
-            lowered = np.where(change, least, lowered)
-            new_pair = np.where(change, better.pair, new_pair)
-            new_going = np.where(change, better.value <= reward, new_going)
-        if lowered is w:
-            return Stopping(np.minimum(w, reward), pair, going, True)
-        new = _stopped(lp, gamma, reward, new_pair, new_going, w, stop)
-        if new is None or not (new < w).any():
-            break  # rounding made a change look better than it is
-        w, pair, going = new, new_pair, new_going
-    return Stopping(np.minimum(w, reward), pair, going, False)
-
-
-def _stopped(
-    lp: StabilizationLP,
-    gamma: float,
-    reward: Floats,
-    pair: Pairs,
-    going: Bools,
-    before: Floats,
-    stop: Stop,
-) -> Floats | None:
-    """Return what a stopping policy is paid: w = gamma P w where it goes, the reward elsewhere.
-
-    It is solved in units of ``before``, as w may fall over many decades.
-    """
-    w = reward.copy()
-    if going.any():
-        unit = np.maximum(before, LEAST_UNIT)
-        P = gamma * lp.rows.matrix(pair[going])
-        P.data *= unit[P.indices] / np.repeat(unit[going], np.diff(P.indptr))
-        new = equations.solve(P[:, going], P[:, ~going] @ (reward / unit)[~going], stop=stop)
-        if new is None:
-            return None
-        w[going] = unit[going] * new
-    return w

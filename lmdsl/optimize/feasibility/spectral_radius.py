@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,14 +20,13 @@ from numpy.typing import NDArray
 
 from lmdsl.certificate import bounds
 from lmdsl.common.types import Bools, Floats, Pairs, Stop, never
-from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.optimize.linear import equations
+from lmdsl.optimize.linear import classes, equations
 from lmdsl.optimize.linear.gauss_seidel import System
-from lmdsl.optimize.policies import bellman, policy
+from lmdsl.optimize.policies import bellman, iteration
 
 TIED = 1e-6
 """Relative difference up to which two classes count as equally slow."""
@@ -69,7 +67,7 @@ class Growth:
     P
         Its rows, CSR, shape (n, n).
     order, ends
-        Its cells by class, every class after all it leads to: see :func:`lmdsl.optimize.linear.equations.classes`.
+        Its cells by class, every class after all it leads to: see ``linear.classes``.
     x
         A positive vector on every class, close to the Perron vector; shape (n,).
     rate
@@ -127,7 +125,7 @@ def of_policy(
     if inside is not None:
         P.data[~(inside[P.indices] & np.repeat(inside, np.diff(P.indptr)))] = 0.0
         P.eliminate_zeros()
-    order, ends = equations.classes(P)
+    order, ends = classes.classes(P)
     x, rate = np.ones(lp.n), P.diagonal()
     lengths = np.diff(ends, prepend=0)
     several = np.flatnonzero(lengths > 1)
@@ -160,7 +158,7 @@ def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
             w = done.value
         yield done.pair, None
         unit, value = np.ones(lp.K), np.full(lp.n, horizon)
-        found = policy.iterate(lp, pair, value, 1 - 1 / horizon, unit, stop=stop)
+        found = iteration.iterate(lp, pair, value, 1 - 1 / horizon, unit, stop=stop)
         yield found.pair, found.value
         yield pair, None
 
@@ -174,64 +172,6 @@ def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
             break
     assert best is not None
     return best
-
-
-def improved(
-    lp: StabilizationLP,
-    found: Growth,
-    stop: Stop = never,
-    until: float = math.inf,
-    least: float = 1e-2 * TIED,
-    inside: Bools | None = None,
-) -> Growth:
-    """Raise the limit of a policy by Howard's policy iteration.
-
-    A control a with (P_a w)_i < (P_u w)_i keeps P_u w <= lam w, w > 0 being the vector that proves
-    the limit 1/lam: no step lowers it. While the limit still rises fast, the rates need not be
-    known well.
-
-    Parameters
-    ----------
-    lp, found, stop
-        The model, a policy, and what ends the work.
-    until, least
-        A limit that is enough, and the relative gain of a step below which it is the last.
-    inside
-        As in :func:`of_policy`, of which ``found`` then comes.
-    """
-    enough = COARSE
-    with suppress(Stopped):
-        for _ in range(ROUNDS):
-            w = lifted(found)
-            if w is None or stop() or found.limit > until:
-                break
-            new = _greedy(lp, found, w, enough, stop, inside)
-            gain = 0.0 if new is None else new.limit / found.limit - 1
-            if new is not None and gain > 0:
-                found, enough = new, min(enough, max(FINE, 1e-2 * gain))
-            elif found.known <= FINE:
-                break
-            if gain < least and found.known > FINE:
-                found = of_policy(lp, found.pair, stop, found.x, FINE, inside)
-            if 0 < gain < least:
-                break
-    return found
-
-
-def _greedy(
-    lp: StabilizationLP, found: Growth, w: Floats, enough: float, stop: Stop, inside: Bools | None
-) -> Growth | None:
-    """Return the policy that is better for the w of another, None where none is."""
-    w = w if inside is None else np.where(inside, w, 0.0)
-    best = bellman.improve(lp, w, 1.0, np.zeros(lp.K))
-    change = best.value < (found.P @ w) * (1 - SLIGHT)
-    if not change.any():
-        return None
-    pair = np.where(change, best.pair, found.pair)
-    new = of_policy(lp, pair, stop, found.x, enough, inside)
-    if new.limit <= found.limit * (1 + enough):
-        return of_policy(lp, pair, stop, new.x, FINE, inside)
-    return new
 
 
 def _perron(
@@ -253,7 +193,7 @@ def _perron(
     a y that is not exact only takes a step more.
     """
     n = inner.shape[0]
-    dense = inner.toarray() if n <= equations.DENSE else None
+    dense = inner.toarray() if n <= classes.DENSE else None
     M = inner if dense is None else dense
     slow_fall = 0.1 if directions is None else 0.9
     x = np.ones(n)

@@ -12,7 +12,7 @@ import numpy as np
 
 from lmdsl.common.types import Floats, Pairs, Stop, never
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.optimize.policies import bellman, policy
+from lmdsl.optimize.policies import bellman, iteration
 
 STEPS, PASSES = 3, 60
 LEAST_RISE = 1e-3
@@ -33,10 +33,10 @@ def survivors(
     stop
         Asked between passes; ends the work with what is known.
     """
-    start = policy.bound(lp, pair, w)
+    start = iteration.bound(lp, pair, w)
     if start is None:
         return np.arange(lp.K)
-    done = policy.iterate(lp, pair, start, stop=stop, limit=STEPS)
+    done = iteration.iterate(lp, pair, start, stop=stop, limit=STEPS)
     lower = np.zeros(lp.n)
     for _ in range(PASSES):
         higher = np.maximum(lower, bellman.improve(lp, lower).value)

@@ -33,9 +33,10 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.problem.problem import Problem, parse_problem
 from lmdsl.results.directory import reading, writing
 from lmdsl.results.directory.reading import FORMAT, Reading
-from lmdsl.results.result import ARRAYS, EXIT, Report, Result, Seconds
+from lmdsl.results.report import EXIT, Report, Seconds
+from lmdsl.results.result import ARRAYS, Result
 from lmdsl.systems import FunctionSystem
-from lmdsl.systems.base import NotStored
+from lmdsl.systems.named import NotStored
 
 SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
 TYPES = {

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.certificate.claims import CLAIMS, MEASURE_TOLERANCE, Certificate
+from lmdsl.certificate.checks import MEASURE_TOLERANCE
+from lmdsl.certificate.claims import CLAIMS, Certificate
 from lmdsl.common.json_values import jsonable
 from lmdsl.control.invariance import SAMPLES, LocalCheck
 from lmdsl.control.invariance import check as check_local
@@ -17,7 +18,7 @@ from lmdsl.model.assembly.sampler import Sampler
 from lmdsl.model.local_controller import LocalController
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.optimize.feasibility import gamma
+from lmdsl.optimize.feasibility import gamma_bar
 from lmdsl.results.directory.archive import SCOPE, identity
 from lmdsl.results.result import Result
 from lmdsl.systems import FunctionSystem
@@ -162,7 +163,7 @@ def _bracket(whole: StabilizationLP, result: Result, found: Certificate) -> list
         if result.cause == "gamma":
             return ["gamma_bar is stored as null, but gamma was refused because of it"]
         return []
-    low, high = gamma.enclosed(whole, *stored)
+    low, high = gamma_bar.enclosed(whole, *stored)
     if found.refusal:
         high = min(high, whole.gamma)
     if 0 <= stored[0] <= low * (1 + _BRACKET) and stored[1] >= high * (1 - _BRACKET):

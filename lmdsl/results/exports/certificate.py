@@ -19,7 +19,7 @@ from lmdsl.errors import BadInput
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.optimize.feasibility.gamma import restricted
+from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory.writing import refuse_own_file
 from lmdsl.results.result import Result
 

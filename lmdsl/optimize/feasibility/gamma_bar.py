@@ -9,7 +9,7 @@ high   w >= 0, w != 0 with w <= high P_a w for every surviving pair: at gamma >=
 gamma_bar is infinite exactly when C is exhausted by levels "some surviving pair has all
 successors in A or in lower levels": then a policy reaches A within a fixed number of steps.
 
-The limit of one policy is found class by class (:mod:`lmdsl.optimize.feasibility.spectral_radius`). Then *optimal stopping* at a
+The limit of one policy is found class by class (``spectral_radius``). Then *optimal stopping* at a
 gamma slightly beyond that limit decides whether the policy is as good as any. Its greatest solution
 w is the upper vector, supported where growth wins and zero elsewhere (plain power iteration would
 not close the bracket for reducible structures); or w = 0, and the policy it ends with is
@@ -21,40 +21,38 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from lmdsl.certificate import bounds
 from lmdsl.common import inputs
 from lmdsl.common.frozen import Frozen
-from lmdsl.common.types import Bools, Floats, Pairs, Progress, Stop, never
+from lmdsl.common.types import Floats, Pairs, Progress, Stop, never
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, Stopped
-from lmdsl.machine.kernels import kernel
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.lp import StabilizationLP, compile
-from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.optimize import descent
-from lmdsl.optimize.feasibility import first_policy, spectral_radius
+from lmdsl.optimize.feasibility import slowest_growth, spectral_radius
+from lmdsl.optimize.feasibility.infeasible import (
+    LEAST_WIDTH,
+    WIDTH,
+    _beyond,
+    _climbed,
+    _core,
+    check_high,
+    exhausted_by_levels,
+)
 from lmdsl.optimize.feasibility.spectral_radius import Growth
-from lmdsl.optimize.policies import policy
 from lmdsl.problem.problem import Problem
-
-WIDTH, LEAST_WIDTH = 1e-6, 1e-8
-"""Relative width of the bracket aimed at, and the least that may be asked for."""
 
 FARTHER = (1e-5, 1e-3, 0.1, 1.0)
 """How far beyond the limit of a policy optimal stopping is asked where doubles decide no nearer."""
 
 COARSE, HALVINGS = 1e-2, 2
 """Relative width down to which the bracket is halved, so often before it is tried to close."""
-
-DODGES = 12
-"""Steps of optimal stopping towards the cells that limit gamma_bar, which only names them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +239,7 @@ class _Search:
         """Narrow the bracket until it closes, or doubles decide no more."""
         best = start or spectral_radius.short_lived(self.lp, self.stop)
         for _ in range(limit):
-            best = spectral_radius.improved(self.lp, best, self.stop, least=0.01 * self.width)
+            best = slowest_growth.improved(self.lp, best, self.stop, least=0.01 * self.width)
             self._raise_low(best)
             if self.stop():
                 return
@@ -305,185 +303,3 @@ class _Search:
         return GammaBar(
             self.low, high, self.pair, self.w_low, self.w_high, note, beyond, limiting, lp.n
         )
-
-
-def check_high(lp: StabilizationLP, w: Floats) -> float | None:
-    """Return the least high (rounded up) with w <= high P_a w for all pairs, None if none is."""
-    if not (np.isfinite(w).all() and (w >= 0).all() and (w > 0).any()):
-        return None
-    ahead = descent.backup_below(lp, w, 1.0, None)
-    on = w > 0
-    if (ahead[on] <= 0).any():
-        return None
-    return float((w[on] / ahead[on]).max()) * (1 + 4 * bounds.UNIT)
-
-
-def exhausted_by_levels(lp: StabilizationLP) -> Pairs | None:
-    """Return a policy that reaches A within n steps surely, None where there is none."""
-    before = lp.predecessors
-    pair = np.full(lp.n, -1, dtype=np.int64)
-    _sure_levels(before.pointer, before.pair, lp.rows.pointer, lp.rows.target, lp.cell, pair)
-    return pair if (pair >= 0).all() else None
-
-
-def _climbed(lp: StabilizationLP, start: Growth, stop: Stop) -> Growth:
-    """Improve a policy under unit cost just below its limit, where its value fits into doubles."""
-    unit = np.ones(lp.K)
-    for below in (1e-3, 0.1):
-        at = start.limit * (1 - below)
-        value = policy.evaluate(lp, start.pair, at, unit, stop=stop)
-        if value is None:
-            continue
-        done = policy.iterate(lp, start.pair, value, at, unit, stop=stop)
-        if not done.steps:
-            return start
-        found = spectral_radius.of_policy(lp, done.pair, stop)
-        return found if found.limit > start.limit else start
-    return start
-
-
-def _beyond(
-    lp: StabilizationLP, start: Growth, gamma: float, stop: Stop, inside: Bools | None = None
-) -> Growth | tuple[float, Floats] | None:
-    """Decide a gamma: a policy that is stabilizing there, or a proved high and its vector.
-
-    Neither where doubles do not decide. The first stopping policy goes on wherever the class of
-    ``start`` does not grow. With ``inside`` the vector is 0 in all other cells.
-    """
-    going = start.rate < (1 - 1e-12) / gamma  # gamma may be infinite
-    reward = np.where(going, 1.0, start.x)  # which nothing changes, where no policy is better
-    if inside is not None:
-        reward, going = np.where(inside, reward, 0.0), going & inside
-    limit = 1000 if inside is None else DODGES
-    found = first_policy.optimal_stopping(lp, gamma, reward, start.pair, going, stop, limit)
-    if found is None:
-        return None
-    if not found.refuses:
-        better = spectral_radius.of_policy(lp, found.pair, stop) if found.going.all() else None
-        return better if better is not None and better.limit > start.limit else None
-    # Small entries may be rounding, or what carries a vector that falls over many decades.
-    for w in (found.carried, found.w):
-        high = check_high(lp, w)
-        if high is not None and high <= gamma * (1 + 1e-9):
-            return high, w
-    return None
-
-
-def _core(
-    lp: StabilizationLP,
-    best: Growth,
-    w_high: Floats,
-    high: float,
-    most: float,
-    stop: Stop,
-) -> tuple[Floats, float]:
-    """Return an upper vector on the slowest classes alone, and a high that holds for it too.
-
-    Their Perron vectors serve where the best policy is also the least favourable one for them. Else
-    stopping is rewarded in these classes only. Where neither closes the bracket (the controls can
-    dodge from one slow class to another), w_high itself serves.
-    """
-    needed = check_high(lp, best.slow_vector)
-    if needed is not None and needed <= most:
-        return best.slow_vector, max(high, needed)
-    # How far the controls can dodge these classes: they limit nothing if far enough.
-    alone = spectral_radius.improved(lp, best, stop, most, inside=best.slowest)
-    if alone.limit > most:
-        return w_high, high
-    answer = None
-    with suppress(Stopped):
-        answer = _beyond(lp, alone, alone.limit * (1 + 0.1 * WIDTH), stop, best.slowest)
-    if isinstance(answer, tuple) and answer[0] <= most:
-        return answer[1], max(high, answer[0])
-    return w_high, high
-
-
-def refusal_message(
-    lp: StabilizationLP, w: Floats, limits: GammaBar, bracket: tuple[float, float]
-) -> str:
-    """Return the sentence that refuses a gamma: the bracket, the cells, and what can be done.
-
-    Parameters
-    ----------
-    lp, w
-        The model, and the vector that proves its gamma infeasible, shape (n,).
-    limits, bracket
-        What is known of gamma_bar.
-    """
-    cells = Area.of(lp.partition, lp.cells[w > 0])
-    left = lp.n - len(cells)
-    parts = [
-        f"gamma = {lp.gamma!r} is not below gamma_bar, which lies in "
-        f"[{bracket[0]:.9g}, {bracket[1]:.9g}]: proved that no control makes the cost finite from "
-        f"{_counted(cells)}"
-    ]
-    limiting = limits.limiting
-    if limiting is not None and len(limiting) != len(cells):
-        parts.append(f"gamma_bar is limited by {_counted(limiting)}")
-    if left:
-        parts.append(
-            "this corner limits gamma_bar for all; lower gamma, or solve on the other "
-            f"{left} cells with --restrict-to-gamma (restrict_to_gamma=True)"
-        )
-    else:
-        parts.append("lower gamma")
-    return "; ".join(parts)
-
-
-def _counted(area: Area) -> str:
-    """Return how many cells an area has, and where, as text."""
-    return f"{len(area)} cell{'s' * (len(area) != 1)} ({area})"
-
-
-def restricted(lp: StabilizationLP, w: Floats) -> StabilizationLP | None:
-    """Leave out the cells a refusal proves infeasible, and the pairs that can lead to them.
-
-    With w the greatest solution of w = min(1, gamma min_a P_a w), every cell with w = 0 keeps a
-    pair whose successors all have w = 0: the smaller model is the part on which gamma is feasible.
-
-    Parameters
-    ----------
-    lp, w
-        The model and the vector of its refusal (claim 6), shape (n,).
-
-    Returns
-    -------
-    StabilizationLP or None
-        The model on the cells with w = 0; the others get the status BEYOND_GAMMA. None where no
-        cell is left, or one is left without a pair.
-    """
-    inside, out = np.flatnonzero(w == 0), ~(w == 0)  # also where a file says -1 or NaN
-    beyond = np.append(out, False)
-    length = np.diff(lp.rows.pointer)
-    leads = np.add.reduceat(beyond[lp.rows.target].astype(np.int64), lp.rows.pointer[:-1]) > 0
-    columns = np.flatnonzero(~leads & (w[lp.cell] == 0) & (length > 0))
-    if not len(inside) or len(np.unique(lp.cell[columns])) < len(inside):
-        return None
-    smaller = lp.part(columns, inside)
-    status = lp.cell_status.copy()
-    status[lp.cells[out]] = CellStatus.BEYOND_GAMMA
-    total = math.fsum(smaller.weight)
-    weight = smaller.weight / total if total > 0 else smaller.weight
-    return replace(smaller, cell_status=status, weight=weight)
-
-
-@kernel(allocates=True)
-def _sure_levels(before_pointer, before_pair, pointer, target, cell, pair):  # type: ignore[no-untyped-def]
-    """Peel off cells with a pair all of whose successors are in A or peeled off before."""
-    n = len(pair)
-    waits = np.empty(len(cell), dtype=np.int32)
-    for k in range(len(cell)):
-        waits[k] = pointer[k + 1] - pointer[k]
-    queue = np.empty(n + 1, dtype=np.int64)
-    queue[0] = n  # the attractor
-    start, end = 0, 1
-    while start < end:
-        j = queue[start]
-        start += 1
-        for e in range(before_pointer[j], before_pointer[j + 1]):
-            k = before_pair[e]
-            waits[k] -= 1
-            if waits[k] == 0 and pair[cell[k]] < 0:
-                pair[cell[k]] = k
-                queue[end] = cell[k]
-                end += 1

@@ -11,23 +11,19 @@ control only where strictly better keeps every policy gamma-stabilizing, zeros i
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Bools, Floats, Pairs, never
+from lmdsl.common.types import Floats, Pairs, never
 from lmdsl.common.types import Stop as Stop
-from lmdsl.machine import memory
 from lmdsl.machine.deadline import Stopped
-from lmdsl.model import stabilizable_set
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.reachability import reaches_attractor
 from lmdsl.optimize.linear import equations, extrapolation
 from lmdsl.optimize.linear.gauss_seidel import CEILING, TOLERANCE
-from lmdsl.optimize.linear.policy_system import of_policy
 from lmdsl.optimize.linear.substitution import Peeled
-from lmdsl.optimize.policies import bellman
+from lmdsl.optimize.policies.evaluation import evaluate, peeled, stability_vector
 from lmdsl.optimize.policies.screening import Pass, Screen
 
 TIE = 1e-12
@@ -45,48 +41,6 @@ PATIENCE = 200
 
 PROBES = 64
 """Rows looked at before all are."""
-
-
-def evaluate(
-    lp: StabilizationLP,
-    pair: Pairs,
-    gamma: float | None = None,
-    cost: Floats | None = None,
-    start: Floats | None = None,
-    transient: bool = False,
-    stop: Stop = never,
-    rows: Peeled | None = None,
-) -> Floats | None:
-    """Return V = G_u + gamma P_u V, shape (n,); None where the policy has no finite value.
-
-    Parameters
-    ----------
-    lp, pair
-        The model, and one column per cell.
-    gamma, cost
-        Other than the LP's own; ``cost`` has shape (K,).
-    start
-        A guess of V.
-    transient
-        The policy is known to be gamma-stabilizing, which saves looking whether it reaches A.
-    stop
-        Ends the work, with :class:`lmdsl.optimize.linear.equations.Stopped`.
-    rows
-        gamma P_u, where it is at hand.
-    """
-    gamma = lp.gamma if gamma is None else gamma
-    b = (lp.cost if cost is None else cost)[pair]
-    if gamma >= 1 and not transient and not reaches_attractor(lp, pair).all():
-        return None
-    x = np.array(b if start is None else start, dtype=np.float64)
-    rows = peeled(lp, pair, gamma) if rows is None else rows
-    found = equations.solve_from(rows, b, x, lambda: gamma * lp.rows.matrix(pair), stop=stop)
-    return x if found else None
-
-
-def peeled(lp: StabilizationLP, pair: Pairs, gamma: float) -> Peeled:
-    """Return gamma P_u, ready for :func:`evaluate`."""
-    return Peeled.of(of_policy(lp, pair, gamma))
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +93,7 @@ def iterate(
     Each step changes every control for which another one is better by a relative 1e-12. Then the
     new policy u is evaluated: to the end where few cells lie on cycles, else by sweeps
     V <- T_u V, about as long as the improvement took, or by a leap along the one mode in which they
-    stall (:func:`lmdsl.optimize.linear.extrapolation.leap`); not at all after the first step, and every
+    stall (:func:`~extrapolation.leap`); not at all after the first step, and every
     second time where few controls changed. V >= T_u V stays true whatever the number of sweeps, so
     V falls and every policy on the way is gamma-stabilizing (docs/mathematics.md, Policy
     iteration); only a policy evaluated to the end is returned as the last.
@@ -258,119 +212,3 @@ def _covering(w: Floats, d: Floats, cost: Floats) -> Floats | None:
 def _close(factor: float, d: Floats, cost: Floats) -> bool:
     """Return whether c w is within a percent of a policy's value, for w >= g P_u w + d."""
     return bool((d * (factor * (1 - 1e-2)) <= cost).all())
-
-
-def canonical(
-    lp: StabilizationLP,
-    pair: Pairs,
-    value: Floats,
-    screen: Screen | None = None,
-    stop: Stop = never,
-) -> Pairs:
-    """Break ties so that the policy reaches A: the policy that every backend ends with.
-
-    Tied are the columns with Q <= Q_min + 1e-12 |Q_min|. Among them take those optimal for unit
-    cost weighted with g, then the smallest control index; cells from which that cost is infinite
-    take the smallest tied index. Where there is no memory for that, the policy at hand stays.
-
-    Parameters
-    ----------
-    lp, pair, value
-        The model, an optimal policy and its value.
-    screen
-        Lower bounds of the rivals of each cell's control at this value, where they are known.
-    stop
-        Ends the work, with :class:`lmdsl.optimize.linear.equations.Stopped`.
-    """
-    if screen is None:
-        screen = Screen(lp)
-    ties, first, several = screen.tied(value, TIE, pair)
-    if not several:
-        return first
-    if not memory.fits(_taken_by_ties(lp, int(ties.sum()))):
-        return pair
-    if ties.all():  # the whole model, of which no copy is made
-        sub, start, columns, inside = lp, pair, None, np.arange(lp.n)
-    else:
-        found = stabilizable_set.stabilizable(*_columns(lp, ties))
-        if not found.inside.any():
-            return first
-        columns = np.flatnonzero(ties)[found.surviving]
-        inside = np.flatnonzero(found.inside)
-        sub = lp.part(columns, inside)
-        start = np.searchsorted(columns, pair[inside])
-        start = np.minimum(start, len(columns) - 1)
-        owned = columns[start] == pair[inside]
-        if not owned.all():
-            start = np.where(owned, start, sub._algorithm_1[1])
-    del ties
-    unit = np.ones(sub.K)
-    w = _even(sub, start, lp.growth, np.ones(sub.n))
-    if w is None:
-        w = evaluate(sub, start, lp.growth, unit, stop=stop)
-    if w is None:
-        start = sub._algorithm_1[1]
-        w = evaluate(sub, start, lp.growth, unit, stop=stop)
-    if w is None:
-        return pair
-    done = iterate(sub, start, w, lp.growth, unit, stop=stop)
-    if stop():
-        raise Stopped
-    least = bellman.improve(sub, done.value, lp.growth, unit).value
-    equal = bellman.tied(replace(sub, gamma=lp.growth, cost=unit), done.value, least, TIE)
-    chosen = first.copy()
-    column = first_column(sub, equal)
-    chosen[inside] = column if columns is None else columns[column]
-    return chosen
-
-
-def _taken_by_ties(lp: StabilizationLP, count: int) -> int:
-    """Return the bytes that breaking ties takes: a model of so many columns, and its costs."""
-    row = len(lp.rows.target) // max(lp.K, 1) + 1
-    copied = 0 if count == lp.K else 60 + row * (8 + lp.rows.code.itemsize)
-    return count * (30 + copied)
-
-
-def first_column(lp: StabilizationLP, allowed: Bools) -> Pairs:
-    """Return the first allowed column of every cell (each cell must have one)."""
-    columns = np.flatnonzero(allowed)
-    return columns[np.searchsorted(columns, lp.pair_pointer[:-1])]
-
-
-def _columns(lp: StabilizationLP, allowed: Bools):  # type: ignore[no-untyped-def]
-    count = np.add.reduceat(allowed, lp.pair_pointer[:-1], dtype=np.int64)
-    pointer = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
-    return pointer, lp.rows.take(np.flatnonzero(allowed))
-
-
-def stability_vector(
-    lp: StabilizationLP,
-    pair: Pairs,
-    guess: Floats | None = None,
-    g: float | None = None,
-    sharp: bool = False,
-    stop: Stop = never,
-    rows: Peeled | None = None,
-) -> tuple[Floats, Floats] | tuple[None, None]:
-    """Return w > 0, d > 0 with w >= g P_u w + d: a proof that the policy is g-stabilizing.
-
-    w is close to the unit-cost value, closer where ``sharp``. Where that spans so many decades that
-    1 is lost in rounding, the value at a slightly larger weight leaves a relative slack instead.
-    """
-    g = lp.growth if g is None else g
-    if guess is not None and (d := bounds.decrease(lp, pair, guess, g)) is not None:
-        return guess, d
-    unit = np.ones(lp.n)
-    w = unit.copy()
-    rows = peeled(lp, pair, g) if rows is None else rows
-    # Sweeps from below leave 1 + g P w - w at most what they still move.
-    if equations.advance(rows, unit, w, 128, 0.0, 1e-2 if sharp else 0.25) < np.inf:
-        d = bounds.decrease(lp, pair, w, g)
-        if d is not None:
-            return w, d
-    units = np.broadcast_to(1.0, lp.K)  # takes no memory
-    for inflation in (0.0, 5e-7, 1e-10):
-        w_more = evaluate(lp, pair, g * (1 + inflation), units, guess, stop=stop)
-        if w_more is not None and (d := bounds.decrease(lp, pair, w_more, g)) is not None:
-            return w_more, d
-    return None, None

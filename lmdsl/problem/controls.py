@@ -1,0 +1,64 @@
+"""The values that a control takes."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from pydantic import BeforeValidator, Tag, model_validator
+
+from lmdsl.common.strict_model import (
+    Count,
+    Declared,
+    Number,
+    Numbers,
+    SchemaWords,
+    frozen_dict,
+    plain,
+)
+from lmdsl.errors import BadInput
+from lmdsl.formulas.names import named_keys, valid_names
+from lmdsl.problem.unions import tag_by_key
+
+
+class ControlRange(Declared):
+    """Equally spaced control values: ``numpy.linspace(low, high, points)``."""
+
+    low: Number
+    high: Number
+    points: Count
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ControlRange:
+        if self.points == 1 and self.low != self.high:
+            raise BadInput(f"one point needs low == high, not {self.low!r} and {self.high!r}")
+        if self.points > 1 and not self.low < self.high:
+            raise BadInput(f"low {self.low!r} must be less than high {self.high!r}")
+        if not math.isfinite(self.high - self.low):
+            raise BadInput(f"high - low overflows: {self.low!r}, {self.high!r}")
+        return self
+
+
+class ControlValues(Declared):
+    """Control values written out; distinct, order kept."""
+
+    values: Annotated[Numbers, SchemaWords({"uniqueItems": True})]
+
+    @model_validator(mode="after")
+    def _distinct(self) -> ControlValues:
+        seen: set[float] = set()
+        for value in self.values:
+            if value in seen:
+                raise BadInput(f"{value!r} stands twice; list each value once", "values")
+            seen.add(value)
+        return self
+
+
+ControlUnion = Annotated[
+    Annotated[ControlValues, Tag("<a>")] | Annotated[ControlRange, Tag("<b>")],
+    tag_by_key("values", ControlValues),
+]
+
+ControlGrid = Annotated[
+    dict[str, ControlUnion], BeforeValidator(plain), valid_names, named_keys, frozen_dict
+]

@@ -1,0 +1,98 @@
+"""Controllers on the attractor cells."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Discriminator, Field, Tag
+
+from lmdsl.common.strict_model import Declared, Number, Numbers, Positive, frozen_dict, plain
+from lmdsl.problem.sets import Point
+from lmdsl.problem.unions import kinds
+
+MAX_ORBIT = 64
+
+NamedNumbers = Annotated[dict[str, Number], BeforeValidator(plain), frozen_dict]
+
+PositiveNumbers = Annotated[dict[str, Positive], BeforeValidator(plain), frozen_dict]
+
+PerPoint = Annotated[
+    Annotated[Number, Tag("<a>")] | Annotated[Numbers, Tag("<b>")],
+    Discriminator(lambda v: "<b>" if isinstance(v, list | tuple | np.ndarray) else "<a>"),
+]
+"""One number for all points of an orbit, or one for each."""
+
+AlongOrbit = Annotated[dict[str, PerPoint], BeforeValidator(plain), frozen_dict]
+
+Gain = Annotated[dict[str, AlongOrbit], BeforeValidator(plain), frozen_dict]
+
+Orbit = Annotated[
+    tuple[Point, ...],
+    Field(min_length=1, max_length=MAX_ORBIT, fail_fast=True),
+    BeforeValidator(plain),
+]
+
+
+class ConstantControl(Declared):
+    """A local controller that holds one control vector on the attractor cells.
+
+    Attributes
+    ----------
+    control
+        Control name to value; controls left out are 0.
+    """
+
+    kind: Literal["constant"] = "constant"
+    control: NamedNumbers = Field(default_factory=dict, validate_default=True)
+
+
+class LinearFeedback(Declared):
+    """A local controller u = u_k - K (x - x_k) around the nearest point of an orbit.
+
+    Attributes
+    ----------
+    orbit
+        The fixed point (one), or the points of a periodic orbit in the order visited.
+    control
+        Control name to its value along the orbit (a number, or one per point); default 0.
+    gain
+        Control name to axis name to an entry of K (a number, or one per point); entries left out
+        are 0.
+    """
+
+    kind: Literal["linear"] = "linear"
+    orbit: Orbit
+    control: AlongOrbit = Field(default_factory=dict, validate_default=True)
+    gain: Gain
+
+
+class LqrFeedback(Declared):
+    """A local controller u = u_k - K_k (x - x_k), K_k by the linear-quadratic regulator (LQR).
+
+    The system is linearised along the orbit; K minimises the sum of x'Qx + u'Ru of the deviations,
+    Q and R diagonal.
+
+    Attributes
+    ----------
+    orbit
+        The fixed point (one), or the points of a periodic orbit in the order visited.
+    control
+        Control name to its value along the orbit (a number, or one per point); default 0.
+    state_weights
+        Axis name to its entry of Q, > 0; default 1 / (cell width)^2 (Bryson's rule).
+    control_weights
+        Control name to its entry of R, > 0; default 1 / (largest |value - control|)^2.
+    """
+
+    kind: Literal["lqr"] = "lqr"
+    orbit: Orbit
+    control: AlongOrbit = Field(default_factory=dict, validate_default=True)
+    state_weights: PositiveNumbers = Field(default_factory=dict, validate_default=True)
+    control_weights: PositiveNumbers = Field(default_factory=dict, validate_default=True)
+
+
+if TYPE_CHECKING:
+    LocalUnion = ConstantControl | LinearFeedback | LqrFeedback
+else:
+    LocalUnion = kinds(ConstantControl, LinearFeedback, LqrFeedback)

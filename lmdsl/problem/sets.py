@@ -1,0 +1,115 @@
+"""Sets of cells: the attractor, what is to be avoided, and where runs start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+
+from lmdsl.common.strict_model import Box, Declared, Number, Numbers, frozen_dict, plain
+from lmdsl.errors import BadInput
+from lmdsl.formulas.names import FormulaText
+from lmdsl.problem.unions import EachWords
+
+MAX_BOXES = 10_000
+
+Point = Annotated[
+    Annotated[tuple[Number, ...], Tag("<a>")]
+    | Annotated[dict[str, Number], frozen_dict, Tag("<b>")],
+    Discriminator(lambda v: "<b>" if isinstance(v, Mapping) else "<a>"),
+    BeforeValidator(plain),
+]
+
+Points = Annotated[tuple[Point, ...], Field(fail_fast=True), BeforeValidator(plain)]
+
+Boxes = Annotated[
+    tuple[Box, ...], Field(max_length=MAX_BOXES, fail_fast=True), BeforeValidator(plain)
+]
+
+SomeBoxes = Annotated[
+    tuple[Box, ...],
+    Field(min_length=1, max_length=MAX_BOXES, fail_fast=True),
+    BeforeValidator(plain),
+]
+
+CellIndex = Annotated[
+    tuple[Annotated[int, Field(strict=True, ge=0, lt=2**31)], ...], BeforeValidator(plain)
+]
+
+CellIndices = Annotated[tuple[CellIndex, ...], Field(fail_fast=True), BeforeValidator(plain)]
+
+
+class Attractor(Declared):
+    """The attractor cells: the union of points, boxes and cells.
+
+    Attributes
+    ----------
+    points
+        Every closed cell within 1e-9 widths of a point; a list or an object per point.
+    boxes
+        The cells inside a box (up to 1e-9 widths).
+    cells
+        Multi-indices of cells.
+    """
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "anyOf": [
+                {"required": [key], "properties": {key: {"not": {"maxItems": 0}}}}
+                for key in ("points", "boxes", "cells")
+            ]
+        }
+    )
+
+    points: Points = ()
+    boxes: Boxes = ()
+    cells: CellIndices = ()
+
+    @model_validator(mode="after")
+    def _something(self) -> Attractor:
+        if not (self.points or self.boxes or self.cells):
+            raise BadInput("no attractor cell; give points, boxes or cells")
+        return self
+
+
+class Avoid(Declared):
+    """Unsafe cells: every cell whose interior overlaps a box. Landing there counts as leaving."""
+
+    boxes: SomeBoxes
+
+
+class Measure(Declared):
+    """The weight m of the starting cells, up to a factor; it is intersected with C and scaled.
+
+    Attributes
+    ----------
+    boxes
+        Only the cells inside their union carry weight.
+    density
+        Formula in the states, evaluated at the centre of each cell; finite and >= 0. Default 1.
+    weights
+        One number >= 0 per cell, C order, instead of a density.
+    """
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "anyOf": [{"required": [key]} for key in ("boxes", "density", "weights")],
+            "not": {"required": ["density", "weights"]},
+        }
+    )
+
+    boxes: SomeBoxes | None = None
+    density: FormulaText | None = None
+    weights: Annotated[Numbers, EachWords({"minimum": 0})] | None = None
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Measure:
+        if self.boxes is None and self.density is None and self.weights is None:
+            raise BadInput("give boxes, a density or weights")
+        if self.density is not None and self.weights is not None:
+            raise BadInput("density and weights exclude each other; keep one")
+        for i, weight in enumerate(self.weights or ()):
+            if weight < 0:
+                raise BadInput(f"{weight!r} is negative; weights are >= 0", f"weights[{i}]")
+        return self

@@ -1,0 +1,182 @@
+"""What is known while a problem is solved, and the result made of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.backends import Backend, Solution
+from lmdsl.certificate import checks
+from lmdsl.certificate.claims import Certificate, Verified, Witness
+from lmdsl.control.invariance import check
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model.discretization import control_count, control_vectors
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local_controller import LocalController
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.problem.problem import Problem
+from lmdsl.results.polishing import _Outcome
+from lmdsl.results.report import Coverage, Seconds
+from lmdsl.results.result import Result
+
+UNKNOWN = 255
+"""Status of cells of which nothing is known."""
+
+
+def not_compiled(
+    backend: str | Backend, problem: Problem, tolerance: float, error: Exception, seconds: float
+) -> Result:
+    """Return what is known of a problem that there was no time to compile."""
+    partition = Partition.of(problem)
+    N = partition.size
+    message = str(error)
+    claims = Certificate(*(False,) * 5, *(None,) * 5, tolerance=tolerance, reasons=(message,))
+    return Result(
+        status="solver_failed",
+        backend=backend if isinstance(backend, str) else backend.name,
+        solver_status="time limit",
+        gamma=problem.gamma,
+        tolerance=tolerance,
+        cells=N,
+        controls=control_count(problem),
+        seconds=Seconds(compile=seconds),
+        message=message,
+        problem=problem,
+        partition=partition,
+        certificate=claims,
+        control_index=np.full(N, -1, dtype=np.int32),
+        value=np.full(N, np.inf),
+        lower=np.zeros(N),
+        measure=np.zeros(N),
+        cell_status=np.full(N, UNKNOWN, dtype=np.uint8),
+        witness=np.zeros(N),
+        control_vectors=control_vectors(problem),
+    )
+
+
+class _Job:
+    """What is known before a result exists; makes the result."""
+
+    def __init__(
+        self,
+        lp: StabilizationLP,
+        backend: Backend,
+        tolerance: float,
+        compile_seconds: float | None,
+        spec: str | None,
+    ) -> None:
+        self.lp, self.tolerance, self.compile_seconds = lp, tolerance, compile_seconds
+        self.backend = spec or backend.name
+        self.finish = Deadline()
+        self.solve_seconds: float | None = None
+        self.verify_seconds: float | None = None
+        self.log = ""
+
+    def refused(
+        self,
+        cause: str,
+        message: str,
+        verified: Verified | None = None,
+        gamma_bar: tuple[float, float] | None = None,
+    ) -> Result:
+        if verified is None:
+            witness = Witness(None)
+            verified = Verified(checks.check(self.lp, witness, self.tolerance), witness)
+        proof = replace(verified.certificate, reasons=(message,))
+        return self._result(
+            verified.witness, proof, "not_stabilizable", message, cause=cause, gamma_bar=gamma_bar
+        )
+
+    def restricted(self, inner: Result, w: NDArray[np.float64]) -> Result:
+        """Add to the result on the feasible cells the proof that the others are infeasible."""
+        count = int((w > 0).sum())
+        return replace(
+            inner,
+            witness=inner.witness + w,
+            seconds=replace(inner.seconds, compile=self.compile_seconds),
+            message=f"{inner.message}; {count} cells are proved infeasible at this gamma",
+        )
+
+    def solved(
+        self, solution: Solution, outcome: _Outcome, verified: Verified, undecided: bool
+    ) -> Result:
+        proof = verified.certificate
+        if proof.verified:
+            status = "verified"
+            free = Coverage.of(self.lp.cell_status).free
+            message = (
+                f"the controller brings every one of {self.lp.n} cells (of {free} free) to the "
+                f"attractor; its cost is within {proof.gap:.2g} of optimal (finite model)"
+            )
+        else:
+            failed = not solution.stop.success and not undecided
+            status = "solver_failed" if failed else "unverified"
+            message = "; ".join(proof.reasons)
+            if failed:
+                message = f"{solution.stop.value} ({solution.word}); {message}"
+            elif undecided:
+                message = (
+                    f"gamma = {self.lp.gamma!r} is so close to its limit, or the way to the "
+                    f"attractor so long, that the numbers decide neither way; {message}"
+                )
+        return self._result(
+            verified.witness,
+            proof,
+            status,
+            message,
+            solver_status=solution.word,
+            polish_steps=outcome.steps,
+            gap_before_polish=outcome.gap_before,
+            iterations=solution.iterations,
+            log=self.log,
+        )
+
+    def _result(
+        self, witness: Witness, proof: Certificate, status: str, message: str, **more: Any
+    ) -> Result:
+        lp, n = self.lp, self.lp.n
+
+        def spread(values: Any, missing: float, attractor: float, outside: float) -> Any:
+            known = np.full(n, missing) if values is None else values
+            return lp.expand(np.asarray(known, dtype=np.float64), attractor, outside)
+
+        index = np.full(lp.partition.size, -1, dtype=np.int32)
+        if witness.pair is not None:
+            index[lp.cells] = lp.control[witness.pair]
+        solved = status != "not_stabilizable"
+        attractor = lp.cell_status == CellStatus.ATTRACTOR
+        local = LocalController.of(lp.problem, lp.partition, attractor)
+        return Result(
+            status=status,
+            backend=self.backend,
+            gamma=lp.gamma,
+            cost=proof.cost if solved else None,
+            lower_bound=(proof.lower or 0.0) if solved else None,
+            gap=proof.gap if solved else None,
+            tolerance=self.tolerance,
+            contraction=proof.contraction,
+            cells=lp.partition.size,
+            controls=len(lp.controls),
+            pairs=lp.K,
+            attractor_cells=int(attractor.sum()),
+            stabilizable_cells=n,
+            local_controller=None if local is None else check(lp.problem, local, self.finish),
+            seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
+            message=message,
+            problem=lp.problem,
+            partition=lp.partition,
+            certificate=proof,
+            control_index=index,
+            value=spread(witness.V_up if proof.upper_bound else None, np.inf, 0.0, np.inf),
+            lower=spread(witness.W if proof.lower_bound else None, 0.0, 0.0, np.inf),
+            measure=spread(witness.mu, 0.0, 0.0, 0.0),
+            cell_status=lp.cell_status,
+            witness=spread(witness.w, 0.0, 0.0, 0.0),
+            control_vectors=lp.controls,
+            lp=lp,
+            **more,
+        )

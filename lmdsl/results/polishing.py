@@ -1,0 +1,102 @@
+"""A backend's policy improved until nothing is strictly better, ties broken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.backends import Solution
+from lmdsl.certificate import checks
+from lmdsl.common.types import Pairs
+from lmdsl.machine.deadline import Deadline, Stopped
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.policies import bellman, evaluation, ties
+from lmdsl.optimize.policies.iteration import Iteration, iterate
+from lmdsl.optimize.witness import certify
+
+
+@dataclass(frozen=True, eq=False)
+class _Outcome:
+    """A policy after polishing, and what polishing did."""
+
+    pair: Pairs
+    value: NDArray[np.float64] | None
+    steps: int
+    gap_before: float | None
+
+
+def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
+    """Return the policy of a solution: its own, else greedy in V, else largest occupation."""
+    if solution.pair is not None:
+        return solution.pair
+    if solution.value is not None:
+        return bellman.improve(lp, np.maximum(solution.value, 0.0)).pair
+    if solution.occupation is not None:
+        theta = solution.occupation
+        top = np.maximum.reduceat(theta, lp.pair_pointer[:-1])
+        return ties.first_column(lp, theta >= top[lp.cell])
+    return None
+
+
+def _polish(
+    lp: StabilizationLP,
+    solution: Solution,
+    iteration: Iteration | None,
+    start: Pairs,
+    tolerance: float,
+    stop: Deadline,
+) -> _Outcome:
+    """Improve a backend's policy exactly until nothing is strictly better, then break ties.
+
+    A policy that is not g-stabilizing is discarded where gamma >= 1. After a limit the policy is
+    left as it is: a limit is not a license to go on.
+    """
+    if iteration is not None and solution.stop.success:  # it ends where polishing would begin
+        return _tidied(lp, iteration, tolerance, 0, None, stop)
+    pair = _claimed(lp, solution)
+    if pair is not None and not _usable(lp, pair, solution.value):
+        pair = None
+    if pair is None:
+        pair = start
+    guess = None if solution.pair is None else solution.value
+    try:
+        value = evaluation.evaluate(
+            lp, pair, start=guess, transient=lp.gamma >= 1, stop=stop.again()
+        )
+    except Stopped:
+        value = None
+    if value is None or solution.stop.limit:
+        return _Outcome(pair, value, 0, None)
+    done = iterate(lp, pair, value, stop=stop)
+    gap_before = None
+    if done.steps:
+        gap_before = certify(lp, pair, tolerance, value, stop.again()).certificate.gap
+    return _tidied(lp, done, tolerance, done.steps, gap_before, stop)
+
+
+def _tidied(
+    lp: StabilizationLP,
+    done: Iteration,
+    tolerance: float,
+    steps: int,
+    gap_before: float | None,
+    stop: Deadline,
+) -> _Outcome:
+    """Break ties; where that costs more than the tolerance the strict minimisers stay."""
+    try:
+        tidy = ties.canonical(lp, done.pair, done.value, done.screen, stop)
+    except Stopped:
+        tidy = done.pair
+    if (tidy != done.pair).any() and _usable(lp, tidy, done.value):
+        tidy_value = evaluation.evaluate(lp, tidy, start=done.value, transient=lp.gamma >= 1)
+        limit = (1 + tolerance / 4) * checks.weighted(lp, done.value)
+        if tidy_value is not None and checks.weighted(lp, tidy_value) <= limit:
+            return _Outcome(tidy, tidy_value, steps, gap_before)
+    value = done.value if done.converged else None  # else perhaps only a bound of it
+    return _Outcome(done.pair, value, steps, gap_before)
+
+
+def _usable(lp: StabilizationLP, pair: Pairs, guess: NDArray[np.float64] | None) -> bool:
+    return lp.gamma < 1 or evaluation.stability_vector(lp, pair, guess)[0] is not None

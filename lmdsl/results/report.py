@@ -1,0 +1,147 @@
+"""The scalar part of a result."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.frozen import Frozen
+from lmdsl.common.json_values import jsonable
+from lmdsl.control.invariance import LocalCheck
+from lmdsl.control.simulation import Simulation
+from lmdsl.model.grid.boxes import Area
+from lmdsl.model.stabilizable_set import CellStatus
+
+EXIT = {"verified": 0, "unverified": 1, "bad_input": 2, "not_stabilizable": 3, "solver_failed": 4}
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Wall-clock seconds of the three stages."""
+
+    compile: float | None = None
+    solve: float | None = None
+    verify: float | None = None
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How much of the box the controller serves; cells are equal shares of its volume.
+
+    Attributes
+    ----------
+    stabilizable, free
+        Number of cells of C, and of cells outside A and Z.
+    share
+        The one of the other; None where no cell is free.
+    """
+
+    stabilizable: int
+    free: int
+    share: float | None
+
+    @classmethod
+    def of(cls, cell_status: NDArray[np.uint8]) -> Coverage:
+        """Count the cells."""
+        free = int((~np.isin(cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID))).sum())
+        stabilizable = int((cell_status == CellStatus.STABILIZED).sum())
+        return cls(stabilizable, free, stabilizable / free if free else None)
+
+    def __str__(self) -> str:
+        text = f"{self.stabilizable} of {self.free} free cells stabilizable"
+        if self.share is None:
+            return text
+        percent = 100 * self.share if self.share == 1 else min(100 * self.share, 99.99)
+        return f"{text} ({percent:.4g} %)"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Report(Frozen):
+    """The scalar part of a result: the keys of ``lmdsl solve --json``, in order.
+
+    Attributes
+    ----------
+    status
+        ``verified``, ``unverified``, ``not_stabilizable``, ``solver_failed``, ``bad_input``.
+    backend, solver_status
+        Who solved it, and the solver's own word.
+    gamma
+        Geometric weight of the cost.
+    cost, lower_bound, gap, tolerance
+        m'V_up, m'W, their relative difference, and the largest gap that counts as verified.
+    contraction
+        Proved bound on the spectral radius of max(gamma, 1) P_u.
+    gamma_bar
+        None or (low, high): proved bracket of the largest feasible gamma.
+    cells, controls, pairs
+        N, M and the number of surviving pairs.
+    attractor_cells, stabilizable_cells
+        Number of cells of A and C.
+    polish_steps
+        Improvement steps made on the backend's policy.
+    seconds
+        Wall-clock time per stage.
+    message
+        One sentence for people.
+    local_controller
+        Whether the problem's local controller keeps the attractor cells; None without one.
+    simulation
+        Runs of the true map that ``lmdsl solve`` made; None where none was asked for.
+    """
+
+    status: str
+    backend: str | None = None
+    solver_status: str | None = None
+    gamma: float | None = None
+    cost: float | None = None
+    lower_bound: float | None = None
+    gap: float | None = None
+    tolerance: float | None = None
+    contraction: float | None = None
+    gamma_bar: tuple[float, float] | None = None
+    cells: int | None = None
+    controls: int | None = None
+    pairs: int | None = None
+    attractor_cells: int | None = None
+    stabilizable_cells: int | None = None
+    polish_steps: int | None = None
+    seconds: Seconds = field(default_factory=Seconds)
+    message: str = ""
+    local_controller: LocalCheck | None = None
+    simulation: Simulation | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
+        covered, runs = self.coverage, self.simulation
+        return {
+            **self.stored(),
+            "coverage": covered and asdict(covered),
+            "simulation": runs and jsonable(runs.to_dict()),
+        }
+
+    def stored(self) -> dict[str, Any]:
+        """Return the part of the data that certificate.json keeps."""
+        names = [f.name for f in fields(Report) if f.name != "simulation"]
+        cells = self.beyond_gamma
+        return {
+            **{name: jsonable(getattr(self, name)) for name in names},
+            "beyond_gamma": cells and cells.to_dict(),
+        }
+
+    @property
+    def coverage(self) -> Coverage | None:
+        """How much of what is neither attractor nor avoided is stabilizable; None if unknown."""
+        return None
+
+    @property
+    def beyond_gamma(self) -> Area | None:
+        """The cells proved infeasible at this gamma, by region; None where none is."""
+        return None
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the command line."""
+        return EXIT[self.status]
