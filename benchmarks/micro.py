@@ -28,7 +28,7 @@ def measure(name: str, repeats: int) -> dict[str, Any]:
     problem, lp = model.make(), model.compiled()
     result = lm.solve(lp)
     V = result.value[lp.cells]
-    pair = internals.improvement_sweep(lp, V)().pair
+    pair = internals.improvement_sweep(lp, V)().policy
     pointer, target, _ = internals.transitions(lp)
     entries = len(target)
     policy_entries = int((pointer[pair + 1] - pointer[pair]).sum())

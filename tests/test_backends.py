@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from lmdsl import backends
-from lmdsl.backends import BUILT_IN, Options, Solution, Stop, get, names, resolve
+from lmdsl.backends import BUILT_IN, Options, Solution, Stop, get, names, registry, resolve
 from lmdsl.backends import clarabel as clarabel_backend
 from lmdsl.backends import cvxpy as cvxpy_backend
 from lmdsl.backends import highs as highs_backend
@@ -371,10 +371,10 @@ def test_no_solver_is_imported_unasked():
 
 def test_an_algorithm_that_is_not_installed_is_listed_as_such(monkeypatch, capsys):
     def none(name):
-        raise backends.PackageNotFoundError(name)
+        raise registry.PackageNotFoundError(name)
 
     highs = get("highs")
-    monkeypatch.setattr(backends, "version", none)
+    monkeypatch.setattr(registry, "version", none)
     assert backends.missing(highs) == {"hipo": "highspy-extras"}
     assert main(["backends"]) == 0
     assert "simplex, hipo (not installed: highspy-extras), pdlp" in capsys.readouterr().out
@@ -382,7 +382,7 @@ def test_an_algorithm_that_is_not_installed_is_listed_as_such(monkeypatch, capsy
     listed = json.loads(capsys.readouterr().out)
     assert listed["highs"]["not_installed"] == {"hipo": "highspy-extras"}
     assert listed["clarabel"]["not_installed"] == {}
-    monkeypatch.setattr(backends, "version", lambda _: "1.0")
+    monkeypatch.setattr(registry, "version", lambda _: "1.0")
     assert backends.missing(highs) == {}
     assert main(["backends"]) == 0
     assert "not installed" not in capsys.readouterr().out

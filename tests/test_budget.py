@@ -20,6 +20,7 @@ from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
 from lmdsl.model import discretization
 from lmdsl.model.assembly.transitions import estimate
+from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import Regions
 
 HERE = Path(__file__).parent
@@ -95,7 +96,7 @@ def test_boxes_are_resolved_one_at_a_time():
             avoid={"boxes": [{"x": [0.5 + 1e-3 * k, 0.9]} for k in range(300)]},
         )
     )
-    partition = lm.lp.Partition.of(problem)
+    partition = Partition.of(problem)
     tracemalloc.start()
     regions = Regions.of(problem, partition)
     taken = tracemalloc.get_traced_memory()[1]
@@ -109,7 +110,7 @@ def test_a_density_is_evaluated_in_parts():
     cells, text = 200_000, "sin(x)**2 + cos(x)*cos(x) + exp(x)"
     box = {"x": {"low": 0, "high": 1, "cells": cells}}
     problem = made(steps(state_box=box, measure={"density": text}))
-    partition = lm.lp.Partition.of(problem)
+    partition = Partition.of(problem)
     tracemalloc.start()
     mass = Regions.of(problem, partition).mass
     taken = tracemalloc.get_traced_memory()[1]

@@ -69,11 +69,11 @@ def test_the_answers_satisfy_bellmans_equation(one):
 
 def honest(lp, options):
     found = howard(lp, options)
-    if found.pair is None or not found.stop.success:
+    if found.policy is None or not found.stop.success:
         return found
-    Pu = lp.P[found.pair].toarray()
+    Pu = lp.P[found.policy].toarray()
     theta = np.zeros(lp.K)
-    theta[found.pair] = np.linalg.solve(np.eye(lp.n) - lp.gamma * Pu.T, lp.solve_weight)
+    theta[found.policy] = np.linalg.solve(np.eye(lp.n) - lp.gamma * Pu.T, lp.solve_weight)
     return replace(found, occupation=theta)
 
 
@@ -97,7 +97,7 @@ def optimal(lp, value, **parts):
 
 def takes_gamma_below_one_as_one(lp, options):
     found = honest(replace(lp, gamma=1.0) if lp.gamma < 1 and lp.cost.all() else lp, options)
-    return replace(found, pair=None, occupation=None)
+    return replace(found, policy=None, occupation=None)
 
 
 def piles_up(lp, options, found):
@@ -137,7 +137,7 @@ def value_iteration(lp, options, found):
 def believes_the_start(lp, options, found):
     if options.start is None:
         return found
-    return optimal(lp, evaluate(lp, options.start), pair=options.start)
+    return optimal(lp, evaluate(lp, options.start), policy=options.start)
 
 
 def never_late(lp, options):
@@ -193,10 +193,10 @@ BREAKS = [
     ("algorithms", replace(HONEST, capabilities=replace(ABLE, algorithms=("a", "a")))),
     ("value", replace(HONEST, solve=takes_gamma_below_one_as_one)),
     ("occupation", spoiled(piles_up)),
-    ("policy", spoiled(lambda lp, o, s: (s.pair is None and s) or replace(
-        s, pair=lp.pair_pointer[:-1].copy()))),
-    ("policy", spoiled(lambda lp, o, s: (s.pair is None and s) or replace(
-        s, pair=np.zeros(lp.n, dtype=np.int64) + lp.K - 1))),
+    ("policy", spoiled(lambda lp, o, s: (s.policy is None and s) or replace(
+        s, policy=lp.pair_pointer[:-1].copy()))),
+    ("policy", spoiled(lambda lp, o, s: (s.policy is None and s) or replace(
+        s, policy=np.zeros(lp.n, dtype=np.int64) + lp.K - 1))),
     ("vertex", spoiled(splits_ties)),
     ("dual sign", spoiled(lambda lp, o, s: (s.value is None and s) or replace(s, value=-s.value))),
     ("exact tie", where(duplicates)),
@@ -283,21 +283,21 @@ def test_what_the_record_rules_out_is_skipped():
     assert "tolerance=False" in next(c.reason for c in report if c.name == "tolerance")
 
 
-@pytest.mark.parametrize("part", ["value", "occupation", "pair"])
+@pytest.mark.parametrize("part", ["value", "occupation", "policy"])
 def test_one_part_of_a_solution_is_enough(part):
     def only(lp, options, found):
-        others = {"value", "occupation", "pair"} - {part}
+        others = {"value", "occupation", "policy"} - {part}
         return replace(found, **dict.fromkeys(others))
 
     skipped = {"value": {"occupation", "vertex", "policy"}, "occupation": {"dual sign", "policy"},
-               "pair": {"dual sign", "occupation", "vertex"}}  # fmt: skip
+               "policy": {"dual sign", "occupation", "vertex"}}  # fmt: skip
     assert names(check_backend(spoiled(only)).skipped) == skipped[part]
 
 
 def test_a_wrong_occupation_or_policy_alone_is_noticed():
     one = known.walk(60)
     lp = one.compile()
-    for parts in ({"pair": lp.tree[1]}, {"occupation": np.full(lp.K, 1.0)}):
+    for parts in ({"policy": lp.tree[1]}, {"occupation": np.full(lp.K, 1.0)}):
         with pytest.raises(Exception, match="off by"):
             judge(one, lp, Solution(Stop.OPTIMAL, "", **parts))
 

@@ -174,13 +174,13 @@ def test_an_interrupt_does_not_wait_for_the_end_of_a_long_part(monkeypatch):
 
 def test_the_restricted_solve_gets_what_is_left(monkeypatch):
     given = []
-    found = solving.feasibility.stabilizing
+    found = solving.first_policy.stabilizing
 
     def noted(lp, stop):
         given.append(stop)
         return found(lp, stop)
 
-    monkeypatch.setattr(solving.feasibility, "stabilizing", noted)
+    monkeypatch.setattr(solving.first_policy, "stabilizing", noted)
     # Cell 0 of the first half is left half the time; the second half knows no such corner.
     data = {
         "format": "lmdsl/1",
@@ -207,7 +207,7 @@ def test_verifying_ends_too_and_claims_no_more_than_it_proved(monkeypatch):
     for n in (1, 2, 5, 20):
         cut = witness.certify(lp, pair, 1e-6, stop=Asked(n))
         assert not cut.certificate.verified
-        np.testing.assert_array_equal(cut.witness.pair, pair)
+        np.testing.assert_array_equal(cut.witness.policy, pair)
         for name in ("stabilizing", "upper_bound", "lower_bound", "measure"):
             assert getattr(cut.certificate, name) <= getattr(whole.certificate, name)
 

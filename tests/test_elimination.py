@@ -24,13 +24,13 @@ def first(lp):
 
 def optimum(lp):
     found = first(lp)
-    return iteration.iterate(lp, found.pair, iteration.bound(lp, found.pair, found.w)).value
+    return iteration.iterate(lp, found.policy, iteration.bound(lp, found.policy, found.w)).value
 
 
 def left_out_are_worse(lp):
     """Return how many columns are left out; each must cost more than the optimum."""
     found = first(lp)
-    kept = presolve.survivors(lp, found.pair, found.w)
+    kept = presolve.survivors(lp, found.policy, found.w)
     assert (np.diff(kept) > 0).all()
     out = np.setdiff1d(np.arange(lp.K), kept)
     V = optimum(lp)
@@ -58,8 +58,8 @@ def test_random_models(seed):
 def test_time_is_up():
     lp = lm.compile(made(standard_map(10)))
     found = first(lp)
-    kept = presolve.survivors(lp, found.pair, found.w, lambda: True)
-    assert np.isin(found.pair, kept).all()
+    kept = presolve.survivors(lp, found.policy, found.w, lambda: True)
+    assert np.isin(found.policy, kept).all()
 
 
 @pytest.mark.parametrize("name", ["highs:simplex", "clarabel", "cvxpy"])

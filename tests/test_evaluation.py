@@ -191,7 +191,7 @@ def test_a_policy_is_proved_stabilizing_as_long_as_sweeps_gain(monkeypatch):
     start, unit = np.full(lp.n, horizon), np.ones(lp.K)
     done = iteration.iterate(lp, lp.tree[1], start, 1 - 1 / horizon, unit, limit=6)
     calls.clear()
-    assert first_policy._proved(lp, done.pair, done.value, types.never) is not None
+    assert first_policy._proved(lp, done.policy, done.value, types.never) is not None
     assert len(calls) > 1
 
 
@@ -210,7 +210,7 @@ def test_policies_of_mixing_models_are_the_same_with_and_without_leaps(monkeypat
             plain = iteration.iterate(lp, pair, start)
         np.testing.assert_allclose(done.value, plain.value, rtol=1e-11)
         screen = Screen(lp)
-        screen.slots.system(done.pair)
+        screen.slots.system(done.policy)
         taken += not Peeled.of(screen.slots.held).small
     assert taken
 

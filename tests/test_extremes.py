@@ -28,6 +28,7 @@ from lmdsl.model import stabilizable_set
 from lmdsl.model.discretization import Nodes
 from lmdsl.model.rows import Rows, Shares
 from lmdsl.optimize.feasibility import first_policy, spectral_radius
+from lmdsl.results.result import CostFrom
 
 LARGEST = sys.float_info.max
 NUMBERS = [
@@ -193,7 +194,7 @@ def drawn_witness(rng, model):
 
 def told(model, choice, witness, proof):
     """Return what the stand-alone checker says of a certificate: claim by number to yes or no."""
-    lp, refusal = model.lp, witness.pair is None
+    lp, refusal = model.lp, witness.policy is None
     stated = {"contraction": proof.contraction, "cost": proof.cost, "lower_bound": proof.lower}
     head = {
         "format": "lmdsl-certificate/1",
@@ -239,7 +240,7 @@ def judge(rng):
     choice, witness = drawn_witness(rng, model)
     fast, exact = check(lp, witness, TOLERANCE), check_exactly(lp, witness, TOLERANCE)
     alone = told(model, choice, witness, exact)
-    if witness.pair is None:
+    if witness.policy is None:
         w = witness.w.tolist()
         truth = any(w) and all(
             Fraction(w[i]) <= model.backup(i, k, w, model.gamma, False)
@@ -489,7 +490,7 @@ def test_conditional_costs_are_outward(n):
         assert Fraction(down) <= exact <= Fraction(min(up, LARGEST))
         assert up <= down * (1 + 1e-12) + 1e-323
     result = lm.solve(made(one_axis(3, "0.5", False, "5e-324")))
-    assert result.cost_from({"x": (1, 3)}) == lm.result.CostFrom(5e-324, 5e-324, 1.0)
+    assert result.cost_from({"x": (1, 3)}) == CostFrom(5e-324, 5e-324, 1.0)
 
 
 def test_a_cost_beyond_the_doubles_is_no_bound():

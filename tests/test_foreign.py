@@ -18,7 +18,7 @@ import pytest
 from problems import made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl.backends import Backend, Capabilities, Options, Solution, Stop
+from lmdsl.backends import Backend, Capabilities, Options, Solution, Stop, registry
 from lmdsl.backends.asking import ask
 from lmdsl.cli import main
 from lmdsl.machine import surroundings
@@ -119,12 +119,12 @@ def test_arrays_are_copied_into_plain_ones(lp, truth, lie, wrong):
     def claims(lp, options):
         theta = np.ones(lp.K)
         return optimal(lp, value=LIES[lie](value), occupation=LIES[lie](theta),
-                       pair=LIES[lie](pair))  # fmt: skip
+                       policy=LIES[lie](pair))  # fmt: skip
 
     found = asked(lp, claims)
     assert exact(found.value, np.float64)
     assert exact(found.occupation, np.float64)
-    assert exact(found.pair, np.int64)
+    assert exact(found.policy, np.int64)
     result = lm.solve(lp, foreign(claims))
     assert result.status == "verified"
     assert result.cost == pytest.approx(truth.cost, rel=1e-9)
@@ -134,7 +134,7 @@ def test_arrays_are_copied_into_plain_ones(lp, truth, lie, wrong):
 def test_an_array_that_finds_every_comparison_true_proves_nothing(lp, truth):
     def claims(lp, options):
         return optimal(
-            lp, value=np.ones(lp.n).view(Agreeable), pair=lp.pair_pointer[:-1].view(Agreeable)
+            lp, value=np.ones(lp.n).view(Agreeable), policy=lp.pair_pointer[:-1].view(Agreeable)
         )
 
     result = lm.solve(lp, foreign(claims))
@@ -168,14 +168,14 @@ def test_what_is_no_vector_of_finite_numbers_is_left_out(lp, kind):
     found = asked(lp, lambda lp, o: optimal(lp, value=make(lp.n), occupation=make(lp.K)))
     assert found.value is None
     assert found.occupation is None
-    assert asked(lp, lambda lp, o: optimal(lp, pair=make(lp.n))).pair is None
+    assert asked(lp, lambda lp, o: optimal(lp, policy=make(lp.n))).policy is None
 
 
 @pytest.mark.parametrize("bad", [np.uint64(2**63), np.int64(-1), np.uint64(2**64 - 1)])
 def test_columns_far_away_are_no_policy(lp, bad):
     pair = lp.pair_pointer[:-1].astype(type(bad))
     pair[0] = bad
-    assert asked(lp, lambda lp, o: optimal(lp, pair=pair)).pair is None
+    assert asked(lp, lambda lp, o: optimal(lp, policy=pair)).policy is None
 
 
 def test_arrays_that_are_changed_later_do_not_matter(lp, truth):
@@ -193,7 +193,7 @@ def test_arrays_that_are_changed_later_do_not_matter(lp, truth):
 
     def claims(lp, options):
         thread.start()
-        return optimal(lp, value=value, pair=pair)
+        return optimal(lp, value=value, policy=pair)
 
     try:
         result = lm.solve(lp, foreign(claims))
@@ -210,14 +210,14 @@ class Changing(Solution):
     looked = 0
 
     def __getattribute__(self, name):
-        if name == "pair":
+        if name == "policy":
             Changing.looked += 1
         return super().__getattribute__(name)
 
 
 def test_each_part_is_read_once(lp):
     Changing.looked = 0
-    asked(lp, lambda lp, o: Changing(Stop.OPTIMAL, "optimal", pair=lp.tree[1]))
+    asked(lp, lambda lp, o: Changing(Stop.OPTIMAL, "optimal", policy=lp.tree[1]))
     assert Changing.looked == 1
 
 
@@ -241,7 +241,7 @@ class Shouting(str):
 @pytest.mark.parametrize("word", [None, 7, Unspeakable(), "a\nb\x1b[2J\x00c", "\ud800", "x" * 10**6,
                                   b"bytes", Shouting("loud"), ["list"]])  # fmt: skip
 def test_words_become_one_printable_line(lp, word, capsys, tmp_path):
-    result = lm.solve(lp, foreign(lambda lp, o: Solution(Stop.OPTIMAL, word, pair=lp.tree[1])))
+    result = lm.solve(lp, foreign(lambda lp, o: Solution(Stop.OPTIMAL, word, policy=lp.tree[1])))
     assert result.status == "verified"
     assert type(result.solver_status) is str
     assert result.solver_status.isprintable()
@@ -256,7 +256,7 @@ def test_words_become_one_printable_line(lp, word, capsys, tmp_path):
 ])  # fmt: skip
 def test_iterations_are_a_count_or_nothing(lp, given, kept, tmp_path):
     def claims(lp, options):
-        return Solution(Stop.OPTIMAL, "optimal", pair=lp.tree[1], iterations=given)
+        return Solution(Stop.OPTIMAL, "optimal", policy=lp.tree[1], iterations=given)
 
     result = lm.solve(lp, foreign(claims))
     assert (result.iterations, type(result.iterations)) == (kept, type(kept))
@@ -434,7 +434,7 @@ def spoil_axes(problem):
 def test_a_backend_that_changes_the_problem_spoils_its_own_copy(truth, spoil, tmp_path):
     def spoils(lp, options):
         spoil(lp.problem)
-        return optimal(lp, pair=lp.tree[1])
+        return optimal(lp, policy=lp.tree[1])
 
     problem = made(PROBLEM)
     lp = lm.compile(problem)
@@ -459,7 +459,7 @@ def test_the_function_of_a_problem_is_not_copied():
 
     def looks(lp, options):
         seen.append(lp.problem.system.next)
-        return optimal(lp, pair=lp.tree[1])
+        return optimal(lp, policy=lp.tree[1])
 
     assert lm.solve(problem, foreign(looks)).solver_status == "optimal"
     assert seen == [problem.system.next]
@@ -478,7 +478,7 @@ def test_a_backend_that_goes_on_in_a_thread_does_not_matter(lp, truth):
 
         threads.append(threading.Thread(target=scribble))
         threads[0].start()
-        return optimal(lp, pair=lp.tree[1])
+        return optimal(lp, policy=lp.tree[1])
 
     try:
         result = lm.solve(lp, foreign(claims))
@@ -555,7 +555,7 @@ PACKAGE = """
 from lmdsl.backends import Backend, Capabilities, Solution, Stop
 NUMBER = 7
 def solve(lp, options):
-    return Solution(Stop.OPTIMAL, "optimal", pair=lp.tree[1])
+    return Solution(Stop.OPTIMAL, "optimal", policy=lp.tree[1])
 GOOD = Backend("good", solve)
 RECORD = Backend("record", solve, capabilities=None)
 NAMES = Backend("names", solve, Capabilities(algorithms=(1, "\\x1b")))
@@ -639,7 +639,7 @@ def test_what_is_broken_is_said_with_the_package(installed, name):
 
 
 def test_an_extra_that_is_missing_is_named(monkeypatch, lp):
-    monkeypatch.setattr(lm.backends, "_found", lambda package: package != "casadi")
+    monkeypatch.setattr(registry, "_found", lambda package: package != "casadi")
     assert "ipopt" not in lm.backends.installed()
     assert "ipopt" in lm.backends.names()
     with pytest.raises(lm.BadInput, match="ipopt needs the package casadi"):

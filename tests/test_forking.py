@@ -12,7 +12,7 @@ pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 CHILD = """
 import os, signal, threading
 import lmdsl as lm
-from lmdsl import forking, kernels
+from lmdsl.machine import forking, kernels
 
 GUARD = 120  # seconds after which a child counts as waiting for ever
 
@@ -87,13 +87,13 @@ def test_a_child_of_multiprocessing_that_imports_late_is_noticed(tmp_path, metho
     import multiprocessing
 
     def ask(_):
-        from lmdsl import forking  # not imported before the fork
+        from lmdsl.machine import forking  # not imported before the fork
         return forking.forked()
 
     if __name__ == "__main__":
         with multiprocessing.get_context({method!r}).Pool(1) as pool:
             assert pool.map(ask, [0]) == [{expected}]
-        from lmdsl import forking
+        from lmdsl.machine import forking
         assert not forking.forked()
     """)
     )
@@ -195,7 +195,7 @@ def test_forks_while_other_threads_solve(backend):
 def test_a_fork_while_another_thread_puts_the_streams_back():
     run("""
     import time
-    from lmdsl import quiet
+    from lmdsl.machine import quiet
     close, begun = os.close, threading.Event()
 
     def slow(number):

@@ -265,7 +265,7 @@ CHILD = """
 import json, sys, time, warnings
 warnings.filterwarnings("error", module="lmdsl")
 import lmdsl as lm
-from lmdsl.certificate import Witness
+from lmdsl.certificate.claims import Witness
 warm, *files = sys.argv[1:]
 lm.load(warm)
 def peak():
@@ -340,7 +340,7 @@ AUDIT = """
 import sys, warnings
 warnings.filterwarnings("error", module="lmdsl")
 import lmdsl as lm
-from lmdsl.certificate import Witness
+from lmdsl.certificate.claims import Witness
 warm, *files = sys.argv[1:]
 seen, on = [], False
 WATCHED = ("open", "exec", "compile", "import", "os.listdir", "os.scandir", "os.system",

@@ -21,7 +21,12 @@ from lmdsl.common import types
 from lmdsl.model.discretization import Nodes
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.rows import Rows, Shares
-from lmdsl.optimize.feasibility import first_policy, gamma_bar, slowest_growth, spectral_radius
+from lmdsl.optimize.feasibility import (
+    gamma_bar,
+    slowest_growth,
+    spectral_radius,
+    stopping,
+)
 from lmdsl.optimize.feasibility.infeasible import check_high
 from lmdsl.optimize.feasibility.spectral_radius import check_low
 from lmdsl.optimize.linear import classes, equations
@@ -93,7 +98,7 @@ def test_equal_slow_classes_in_series(n):
     assert found.low <= 100 / 90 <= found.high * (1 + 1e-15)
     assert found.high <= found.low * (1 + 1e-6)
     assert found.note == ""
-    assert lp.control[found.pair].tolist() == [0] * n
+    assert lp.control[found.policy].tolist() == [0] * n
     assert len(found.limiting) == len(found.beyond) == n
     assert n < 40 or found.w_low.max() > 1e200 * found.w_low.min()
     _check_vectors(lp, found)
@@ -155,7 +160,7 @@ def _check_vectors(lp, found):
     assert set(found.limiting.cells) <= set(found.beyond.cells)
     assert len(found.limiting) > 0
     w = [Fraction(float(x)) for x in found.w_low]
-    for i, k in enumerate(found.pair):
+    for i, k in enumerate(found.policy):
         row = lp.rows.exact(int(k))
         ahead = sum(w[j] * s for j, s in row if j < lp.n) / lp.rows.shares.total
         assert Fraction(found.low) * ahead <= w[i]
@@ -226,7 +231,7 @@ def integrator(cells: int, gamma_value: float = 1.0) -> dict:
 def test_long_ways_take_few_policies(monkeypatch):
     """Howard's iteration on the vectors of the classes, not hundreds of stopping policies."""
     lp, calls = lm.compile(made(integrator(60))), []
-    for module, name in ((spectral_radius, "of_policy"), (first_policy, "_stopped")):
+    for module, name in ((spectral_radius, "of_policy"), (stopping, "_stopped")):
         inner = getattr(module, name)
 
         def counted(*args, inner=inner):
@@ -281,7 +286,7 @@ def test_infinite_exactly_when_the_levels_exhaust():
     found = lm.gamma_max(made(steps()))
     assert found.low == found.high == np.inf
     lp = lm.compile(made(steps()))
-    assert lp.control[found.pair].tolist() == [1, 1, 1]
+    assert lp.control[found.policy].tolist() == [1, 1, 1]
     # With one control that can only stay with probability 1/2, the graph test fails.
     data = steps()
     data["system"]["next"] = {"x": "where(x < 0.75, x - 0.25*u, x - 0.25*u*w)"}
@@ -312,7 +317,7 @@ def test_spoiled_vectors_are_refused():
     for value in (0.0, -1.0, np.nan, np.inf):
         w = found.w_low.copy()
         w[0] = value
-        assert check_low(lp, found.pair, w) is None
+        assert check_low(lp, found.policy, w) is None
     assert check_high(lp, np.zeros(lp.n)) is None
     assert check_high(lp, -found.w_high) is None
     w = found.w_high.copy()
@@ -355,7 +360,7 @@ def test_command_line(tmp_path, capsys):
 def test_no_cell_is_not_a_bad_input():
     found = lm.gamma_max(made(steps(avoid={"boxes": [{"x": [0.25, 0.5]}]})))
     assert found.low == found.high == found.stabilizable == 0
-    assert len(found.pair) == 0
+    assert len(found.policy) == 0
     assert found.to_dict()["gamma_bar"] is None
 
 

@@ -274,7 +274,7 @@ def test_columns_and_vectors_of_the_model_are_checked():
         7,
         "a",
     ):
-        refused(lambda bad=bad: lp.under(bad), "pair")
+        refused(lambda bad=bad: lp.under(bad), "policy")
     for bad in ([0, 0.5], [lp.K], [-1], None, "a"):
         refused(lambda bad=bad: lp.part(bad, np.arange(lp.n)), "columns")
     for bad in ([lp.n], [-1], None, [0.5]):

@@ -330,6 +330,6 @@ def test_a_time_limit_holds_within_the_sweeps_of_one_evaluation(monkeypatch):
     backend = lm.backends.get("policy-iteration")
     solution = backend.solve(lp, lm.backends.Options(time_limit=1e-3, start=pair))
     assert solution.stop is lm.backends.Stop.TIME_LIMIT
-    np.testing.assert_array_equal(solution.pair, pair)
+    np.testing.assert_array_equal(solution.policy, pair)
     monkeypatch.undo()
     assert evaluation.evaluate(lp, pair) == pytest.approx(1e4)

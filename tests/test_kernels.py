@@ -313,7 +313,7 @@ def test_a_setting_that_can_be_used_is(setting):
 @pytest.mark.long
 def test_a_command_without_any_folder_for_kernels(tmp_path):
     run = (
-        "import sys; from lmdsl import kernels; kernels.folders = lambda: (); "
+        "import sys; from lmdsl.machine import kernels; kernels.folders = lambda: (); "
         "from lmdsl.cli import main; sys.exit(main(sys.argv[1:]))"
     )
     done = subprocess.run(

@@ -110,7 +110,7 @@ def test_arrays_are_read_only(k):
 def test_what_is_derived_is_read_only_too():
     result = lm.solve(made(steps()))
     for array in (result.weight, result.lp.cell, *result.lp.tree, result.closed_loop.status,
-                  result.controller.index, lm.gamma_max(result.lp).pair):  # fmt: skip
+                  result.controller.index, lm.gamma_max(result.lp).policy):  # fmt: skip
         with pytest.raises(ValueError, match="read-only"):
             array[...] = 0
 

@@ -94,10 +94,10 @@ def test_canonical_policy_does_not_depend_on_the_start(seed):
     found = first_policy.stabilizing(lp)
     assert isinstance(found, first_policy.Feasible)
     ends = []
-    for start in (found.pair, _random_proper(lp, rng)):
+    for start in (found.policy, _random_proper(lp, rng)):
         value = evaluation.evaluate(lp, start)
         done = iteration.iterate(lp, start, value)
-        ends.append(ties.canonical(lp, done.pair, done.value))
+        ends.append(ties.canonical(lp, done.policy, done.value))
     np.testing.assert_array_equal(ends[0], ends[1])
 
 

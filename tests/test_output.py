@@ -59,7 +59,7 @@ def solve(lp, options):
     if options.algorithm == "late":
         atexit.register(shout, "end")
     own = backends.get("policy-iteration").solve(lp, options)
-    return backends.Solution(own.stop, "ok\\x1b[2J\\n{}", own.value, None, own.pair)
+    return backends.Solution(own.stop, "ok\\x1b[2J\\n{}", own.value, None, own.policy)
 
 BACKEND = backends.Backend(
     "noisy", solve, backends.Capabilities(algorithms=("works", "refused", "fails", "late"))
@@ -163,7 +163,7 @@ print("after")
 @posix
 def test_python_prints_nothing_of_a_solver(tmp_path, noisy):
     (tmp_path / "quiet.py").write_text(QUIET.replace("import noisy\n", "", 1).replace(
-        "problem =", "with lm.quiet.foreign():\n    import noisy\nproblem =", 1
+        "problem =", "with lmdsl.machine.quiet.foreign():\n    import noisy\nproblem =", 1
     ).replace("import lmdsl as lm", "import lmdsl as lm\nimport lmdsl.machine.quiet"))  # fmt: skip
     done = python(tmp_path, noisy, "quiet.py")
     assert done.returncode == 0, done.stderr
@@ -343,7 +343,7 @@ def test_descriptors_are_not_leaked(capfd):
 def test_a_fork_during_a_solve_prints(tmp_path, noisy):
     (tmp_path / "fork.py").write_text("""
 import os, sys, threading
-from lmdsl import quiet
+from lmdsl.machine import quiet
 inside, go = threading.Event(), threading.Event()
 def work():
     with quiet.foreign():

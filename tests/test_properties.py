@@ -63,7 +63,7 @@ class Solved:
         self.choice = result.control_index[lp.cells]
 
     @property
-    def pair(self):
+    def policy(self):
         return self.lp.pair_pointer[:-1] + self.choice
 
     def strict(self):
@@ -209,7 +209,7 @@ def dearer_by_a_constant(rng):
     assert a.status == b.status == "verified"
     assert_at_least(b.V, a.V + c)
     # No dearer than keeping the old policy: c times its expected time to A.
-    P = a.lp.P[a.pair]
+    P = a.lp.P[a.policy]
     time = np.linalg.solve(np.eye(a.lp.n) - P.toarray(), np.ones(a.lp.n))
     assert_at_least(a.V + c * time, b.V)
     # Constant costs: the value is the shortest expected time, and A cannot be reached sooner.
@@ -233,8 +233,8 @@ def measure_and_value(rng):
     a = Solved(model, gamma)
     if not a.verified:
         return
-    lp, P = a.lp, a.lp.P[a.pair].toarray()
-    cost = lp.cost[a.pair] @ a.mu
+    lp, P = a.lp, a.lp.P[a.policy].toarray()
+    cost = lp.cost[a.policy] @ a.mu
     assert cost == pytest.approx(lp.weight @ a.V, rel=1e-9, abs=1e-300)
     assert a.mu @ (1 - lp.gamma * P.sum(axis=1)) == pytest.approx(1, abs=1e-9 * a.mu.sum())
     assert a.result.lower_bound <= cost * (1 + 1e-9)
@@ -345,19 +345,19 @@ def test_no_false_claim_passes():
         a = Solved(model, gamma)
         if not a.verified:
             continue
-        whole = Witness(a.pair, a.w, a.V, a.W, a.mu)
+        whole = Witness(a.policy, a.w, a.V, a.W, a.mu)
         for _ in range(50):
             witness = whole
             with np.errstate(all="ignore"):
-                for name in rng.choice(["w", "V_up", "W", "mu", "pair"], rng.integers(1, 3)):
-                    if name == "pair":
-                        pair = a.pair.copy()
+                for name in rng.choice(["w", "V_up", "W", "mu", "policy"], rng.integers(1, 3)):
+                    if name == "policy":
+                        pair = a.policy.copy()
                         pair[rng.integers(len(pair))] = rng.integers(-1, a.lp.K + 1)
-                        witness = replace(witness, pair=pair)
+                        witness = replace(witness, policy=pair)
                     else:
                         witness = replace(witness, **{name: spoil(rng, getattr(witness, name))})
             fast, exact = check(a.lp, witness, 1e-6), check_exactly(a.lp, witness, 1e-6)
-            choice = witness.pair - a.lp.pair_pointer[:-1]
+            choice = witness.policy - a.lp.pair_pointer[:-1]
             truth = truly(model, gamma, a.lp.weight, choice.tolist(), witness)
             for name in CLAIMS:
                 assert getattr(exact, name) == truth[name], name

@@ -12,7 +12,7 @@ from models import mdp, random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl.certificate import claims
+from lmdsl.certificate import checks
 from lmdsl.machine import threads
 from lmdsl.model import rows, vectors
 from lmdsl.optimize import witness
@@ -26,7 +26,7 @@ def test_ranges_and_halves_give_the_same_policy(monkeypatch, workers):
     whole = lm.solve(problem)
     monkeypatch.setattr(vectors, "GRAIN", 1)
     monkeypatch.setattr(gauss_seidel, "SPLIT", 1)
-    for room in (rows, substitution, claims, witness):
+    for room in (rows, substitution, checks, witness):
         monkeypatch.setattr(room, "MANY", 1)
     monkeypatch.setattr(threads, "count", lambda: workers)
     parts = lm.solve(problem)
@@ -53,7 +53,7 @@ def test_a_pass_agrees_with_numpy(monkeypatch):
     monkeypatch.setattr(vectors, "GRAIN", 1)
     found = bellman.improve(lp, V)
     np.testing.assert_allclose(found.value, np.minimum.reduceat(Q, lp.pair_pointer[:-1]))
-    np.testing.assert_allclose(Q[found.pair], found.value)
+    np.testing.assert_allclose(Q[found.policy], found.value)
 
 
 @pytest.mark.parametrize("gamma", [0.9, 1.0, 1.3])
@@ -83,7 +83,7 @@ def test_a_rising_pass_agrees_with_numpy(gamma, monkeypatch):
                     value[i] = x[i] = max(x[i], q.min())
             found = bellman.rise(lp, V, gamma, backwards)
             np.testing.assert_allclose(found.value, value, rtol=1e-12)
-            np.testing.assert_array_equal(found.pair, pair)
+            np.testing.assert_array_equal(found.policy, pair)
     assert rose
     assert bool(stuck) == (gamma >= 1)
 
@@ -91,4 +91,4 @@ def test_a_rising_pass_agrees_with_numpy(gamma, monkeypatch):
 def test_of_equal_controls_a_pass_takes_the_first():
     choices = [({-1: 1}, 2.0), ({-1: 1}, 1.0), ({-1: 1}, 1.0)]
     lp = mdp([choices, choices[1:]], 1, 1.0)
-    assert bellman.improve(lp, np.zeros(2)).pair.tolist() == [1, 3]
+    assert bellman.improve(lp, np.zeros(2)).policy.tolist() == [1, 3]

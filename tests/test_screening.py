@@ -66,7 +66,7 @@ def begun(lp):
     found = first_policy.stabilizing(lp)
     if not isinstance(found, first_policy.Feasible):
         return None
-    return found.pair, iteration.bound(lp, found.pair, found.w)
+    return found.policy, iteration.bound(lp, found.policy, found.w)
 
 
 @pytest.mark.parametrize("ranges", [1, 3])
@@ -86,13 +86,13 @@ def test_passes_agree_with_numpy_and_bounds_hold(monkeypatch, ranges):
             x, new = reference(lp, V, pair, step % 2 == 1, parts, settled)
             done = screen.improve(V, pair, MARGIN)
             np.testing.assert_allclose(done.value, x, rtol=1e-13)
-            np.testing.assert_array_equal(done.pair, new)
+            np.testing.assert_array_equal(done.policy, new)
             assert done.changed == (new != pair).sum()
             np.testing.assert_array_equal(screen.slots.chosen, new)
             np.testing.assert_array_equal(screen.paid, lp.cost[new])
             left_out += lp.K - done.looked
             screen.follow(V, done.value)
-            pair, V = done.pair, done.value
+            pair, V = done.policy, done.value
             assert (screen.rival * screen.scale <= rivals(lp, pair, V)).all()
     assert left_out > 100
 
@@ -105,9 +105,9 @@ def test_ties_are_those_of_a_pass_over_all_rows():
         done = iteration.iterate(lp, *start)
         Q = lp.gamma * (lp.rows.matrix() @ done.value) + lp.cost
         least = np.minimum.reduceat(Q, lp.pair_pointer[:-1])[lp.cell]
-        expected = (least * (1 + MARGIN) >= Q) | (np.arange(lp.K) == done.pair[lp.cell])
+        expected = (least * (1 + MARGIN) >= Q) | (np.arange(lp.K) == done.policy[lp.cell])
         for screen in (done.screen, Screen(lp)):
-            ties, first, more = screen.tied(done.value, MARGIN, done.pair)
+            ties, first, more = screen.tied(done.value, MARGIN, done.policy)
             np.testing.assert_array_equal(ties, expected)
             np.testing.assert_array_equal(first, first_column(lp, expected))
             assert more == (ties.sum() > lp.n)
@@ -125,5 +125,5 @@ def test_bounds_hold_for_a_policy_the_last_pass_did_not_choose():
         changed += screen.improve(V, pair, MARGIN).changed
         done = screen.improve(V, pair, MARGIN)  # the policy from before that pass
         screen.follow(V, done.value)
-        assert (screen.rival * screen.scale <= rivals(lp, done.pair, done.value)).all()
+        assert (screen.rival * screen.scale <= rivals(lp, done.policy, done.value)).all()
     assert changed

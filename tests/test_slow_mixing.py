@@ -43,8 +43,8 @@ def test_where_all_runs_last_as_long_the_first_bound_is_the_value(kill, gamma):
     """No step is made for differences that are rounding."""
     lp = lm.compile(made(killed(kill, gamma=gamma)))
     first = first_policy.stabilizing(lp)
-    start = iteration.bound(lp, first.pair, first.w)
-    done = iteration.iterate(lp, first.pair, start)
+    start = iteration.bound(lp, first.policy, first.w)
+    done = iteration.iterate(lp, first.policy, start)
     np.testing.assert_allclose(start, 1 / (1 - gamma * (1 - kill)), rtol=1e-8)
     assert done.steps <= 1
     result = lm.solve(lp)

@@ -42,12 +42,12 @@ WRONG = {
     ),
     "interior theta": lambda lp, o: Solution(Stop.OPTIMAL, "optimal", None, np.full(lp.K, 1e-9)),
     "first control": lambda lp, o: Solution(
-        Stop.OPTIMAL, "optimal", pair=lp.pair_pointer[:-1].copy()
+        Stop.OPTIMAL, "optimal", policy=lp.pair_pointer[:-1].copy()
     ),
     "foreign column": lambda lp, o: Solution(
-        Stop.OPTIMAL, "optimal", pair=np.zeros(lp.n, dtype=np.int64)
+        Stop.OPTIMAL, "optimal", policy=np.zeros(lp.n, dtype=np.int64)
     ),
-    "float policy": lambda lp, o: Solution(Stop.OPTIMAL, "optimal", pair=np.zeros(lp.n)),
+    "float policy": lambda lp, o: Solution(Stop.OPTIMAL, "optimal", policy=np.zeros(lp.n)),
     "says infeasible": lambda lp, o: Solution(Stop.INFEASIBLE, "infeasible"),
     "says unbounded": lambda lp, o: Solution(Stop.UNBOUNDED, "unbounded"),
 }
@@ -73,7 +73,7 @@ def test_a_wrong_backend_cannot_make_the_impossible_verified(name):
 @pytest.mark.parametrize("stop", [Stop.TIME_LIMIT, Stop.ITERATION_LIMIT, Stop.INTERRUPTED])
 def test_a_limit_is_not_an_answer(stop):
     def late(lp, options):
-        return Solution(stop, stop.name, pair=lp.tree[1])
+        return Solution(stop, stop.name, policy=lp.tree[1])
 
     result = lm.solve(made(standard_map(20)), backend(late))
     assert result.status == "solver_failed"
@@ -91,7 +91,7 @@ def test_a_limit_with_the_optimum_in_hand_is_verified_all_the_same():
         M = len(lp.controls)
         key = lp.cell.astype(np.int64) * M + lp.control
         wanted = np.arange(lp.n) * M + best.control_index[lp.cells]
-        return Solution(Stop.TIME_LIMIT, "late", pair=np.searchsorted(key, wanted))
+        return Solution(Stop.TIME_LIMIT, "late", policy=np.searchsorted(key, wanted))
 
     assert lm.solve(made(standard_map(10)), backend(late)).status == "verified"
 
@@ -105,7 +105,7 @@ def test_interrupts_pass_through():
 
 
 def test_entry_points(monkeypatch):
-    import lmdsl.backends as registry
+    from lmdsl.backends import registry
 
     class Entry:
         name = "theirs"
@@ -124,7 +124,7 @@ def test_entry_points(monkeypatch):
 def test_a_missing_package_is_named():
     from dataclasses import replace
 
-    import lmdsl.backends as registry
+    from lmdsl.backends import registry
 
     monkey = replace(registry.get("highs"), requires=("no_such_package",))
     assert monkey.requires
@@ -151,7 +151,7 @@ def test_a_backend_cannot_change_the_model():
 
 def test_numbers_of_numpy_are_saved(tmp_path):
     def numpy_numbers(lp, options):
-        return Solution(Stop.OPTIMAL, "ok", pair=lp.tree[1], iterations=np.int64(3))
+        return Solution(Stop.OPTIMAL, "ok", policy=lp.tree[1], iterations=np.int64(3))
 
     lm.solve(made(steps()), backend(numpy_numbers)).save(tmp_path / "out")
     assert lm.Result.load(tmp_path / "out").iterations == 3

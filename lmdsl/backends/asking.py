@@ -40,7 +40,7 @@ def ask(
     Returns
     -------
     solution
-        Its arrays are new, of class ndarray, in C order, finite and of the right length; ``pair``
+        Its arrays are new, of class ndarray, in C order, finite and of the right length; ``policy``
         names a column of each cell's own; parts that are not so are None. ``details`` is empty.
     iteration
         The last step of policy iteration, where it is our own that was asked.
@@ -118,7 +118,7 @@ def _plain(lp: StabilizationLP, found: Any) -> Solution:
         plain_text(word),
         _numbers(found.value, lp.n),
         _numbers(found.occupation, lp.K),
-        _columns(lp, found.pair),
+        _columns(lp, found.policy),
         _count(iterations),
     )
 
@@ -127,12 +127,12 @@ def _over(lp: StabilizationLP, solution: Solution, kept: Pairs | None) -> Soluti
     """Return a solution over all columns, where only some were asked for."""
     if kept is None:
         return solution
-    pair, occupation = solution.pair, solution.occupation
+    policy, occupation = solution.policy, solution.occupation
     if occupation is not None:
         spread = np.zeros(lp.K)
         spread[kept] = occupation
         occupation = spread
-    return replace(solution, pair=None if pair is None else kept[pair], occupation=occupation)
+    return replace(solution, policy=None if policy is None else kept[policy], occupation=occupation)
 
 
 def _own(values: Any, count: int, kinds: str) -> NDArray[Any] | None:
@@ -153,8 +153,8 @@ def _numbers(values: Any, count: int) -> NDArray[np.float64] | None:
     return array if np.isfinite(array).all() else None
 
 
-def _columns(lp: StabilizationLP, pair: Any) -> Pairs | None:
-    array = _own(pair, lp.n, "iu")
+def _columns(lp: StabilizationLP, policy: Any) -> Pairs | None:
+    array = _own(policy, lp.n, "iu")
     if array is None:
         return None
     owned = (array >= lp.pair_pointer[:-1]) & (array < lp.pair_pointer[1:])

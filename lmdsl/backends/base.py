@@ -129,7 +129,7 @@ class Solution:
         V, shape (n,).
     occupation
         theta, shape (K,).
-    pair
+    policy
         A policy, shape (n,): a column per cell.
     iterations
         Iterations in the backend's own sense.
@@ -141,7 +141,7 @@ class Solution:
     word: str
     value: Floats | None = None
     occupation: Floats | None = None
-    pair: NDArray[np.int64] | None = None
+    policy: NDArray[np.int64] | None = None
     iterations: int | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
 

@@ -24,29 +24,29 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
         limit = options.time_limit
         return limit is not None and time.monotonic() - started > limit
 
-    pair, w = options.start, options.proof
-    if pair is None:
+    policy, w = options.start, options.proof
+    if policy is None:
         found = first_policy.stabilizing(lp, late)
         if isinstance(found, first_policy.Refused):
             return Solution(Stop.INFEASIBLE, "infeasible")
         if isinstance(found, first_policy.Undecided):
             stop = Stop.TIME_LIMIT if late() else Stop.FAILED
             return Solution(stop, stop.name.lower())
-        pair, w = found.pair, found.w
+        policy, w = found.policy, found.w
     try:
-        value = iteration.bound(lp, pair, w)
+        value = iteration.bound(lp, policy, w)
         if value is None:
-            value = evaluation.evaluate(lp, pair, stop=late)
+            value = evaluation.evaluate(lp, policy, stop=late)
     except Stopped:
-        return Solution(Stop.TIME_LIMIT, "time_limit", pair=pair)
+        return Solution(Stop.TIME_LIMIT, "time_limit", policy=policy)
     if value is None:
         return Solution(Stop.FAILED, "some cell costs more than 1e305; divide stage_cost")
-    done = iteration.iterate(lp, pair, value, stop=late, limit=options.max_iterations)
+    done = iteration.iterate(lp, policy, value, stop=late, limit=options.max_iterations)
     stop = Stop.OPTIMAL
     if not done.converged:
         stop = Stop.TIME_LIMIT if late() else Stop.ITERATION_LIMIT
     return Solution(
-        stop, stop.name.lower(), done.value, None, done.pair, done.steps, {"iteration": done}
+        stop, stop.name.lower(), done.value, None, done.policy, done.steps, {"iteration": done}
     )
 
 

@@ -31,40 +31,40 @@ NO_BOUNDS, NO_PAIRS = np.empty(0), np.empty(0, dtype=np.int64)
 """No room for a result that is not asked for."""
 
 
-def expected_above(lp: StabilizationLP, pair: Pairs, x: Floats, gamma: float) -> Floats:
+def expected_above(lp: StabilizationLP, policy: Pairs, x: Floats, gamma: float) -> Floats:
     """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
     upper, V = np.empty(lp.n), padded(x)
     above = _above if tame(lp, x, gamma) else _carefully_above
 
     def part(cells: tuple[int, int]) -> None:
-        above(*cells, pair.view(np.uint64), *lp.rows.kernel, gamma, V, upper)
+        above(*cells, policy.view(np.uint64), *lp.rows.kernel, gamma, V, upper)
 
     over_cells(lp, part)
     return upper
 
 
 def inflow(
-    lp: StabilizationLP, pair: Pairs, mu: Floats, gamma: float
+    lp: StabilizationLP, policy: Pairs, mu: Floats, gamma: float
 ) -> tuple[Floats, Floats, Floats]:
     """Return gamma P_u'mu as summed in doubles, and its rounding error: relative and absolute.
 
     The relative error also covers two more operations with the sum. Each of shape (n,).
     """
     total, entries = np.zeros(lp.n + 1), np.zeros(lp.n + 1)
-    _inflow(pair.view(np.uint64), *lp.rows.kernel, gamma, mu, total, entries)
+    _inflow(policy.view(np.uint64), *lp.rows.kernel, gamma, mu, total, entries)
     terms = entries[:-1] + 8
     absolute = (1 + gamma) * terms * LEAST * (1 + mu.max(initial=0.0))
     return total[:-1], terms * UNIT, absolute
 
 
-def decrease(lp: StabilizationLP, pair: Pairs, w: Floats, g: float) -> Floats | None:
+def decrease(lp: StabilizationLP, policy: Pairs, w: Floats, g: float) -> Floats | None:
     """Return d > 0 with w >= g P_u w + d, rounded down; None where w > 0 has no such d.
 
     It proves that the spectral radius of g P_u is at most 1 - min d/w < 1.
     """
     if w.shape != (lp.n,) or not (np.isfinite(w).all() and (w > 0).all()):
         return None
-    d = (w - expected_above(lp, pair, w, g)) * (1 - 4 * UNIT)
+    d = (w - expected_above(lp, policy, w, g)) * (1 - 4 * UNIT)
     return d if (d > 0).all() else None
 
 
@@ -193,18 +193,18 @@ def _plain(entries, q, gamma, g):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _inflow(pair, pointer, target, code, share, gamma, mu, total, entries):  # type: ignore[no-untyped-def]
-    for i in range(np.uint64(len(pair))):
-        k = pair[i]
+def _inflow(policy, pointer, target, code, share, gamma, mu, total, entries):  # type: ignore[no-untyped-def]
+    for i in range(np.uint64(len(policy))):
+        k = policy[i]
         for e in range(pointer[k], pointer[k + ONE]):
             total[target[e]] += gamma * (share[code[e]] * mu[i])
             entries[target[e]] += 1.0
 
 
 @kernel
-def _above(first, last, pair, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
+def _above(first, last, policy, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(first), np.uint64(last)):
-        k = pair[i]
+        k = policy[i]
         q = 0.0
         for e in range(pointer[k], pointer[k + ONE]):
             q += share[code[e]] * V[target[e]]
@@ -213,9 +213,9 @@ def _above(first, last, pair, pointer, target, code, share, gamma, V, upper):  #
 
 
 @kernel
-def _carefully_above(first, last, pair, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
+def _carefully_above(first, last, policy, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(first), np.uint64(last)):
-        q, relative, absolute = _product(pair[i], pointer, target, code, share, V)
+        q, relative, absolute = _product(policy[i], pointer, target, code, share, V)
         future = gamma * (q * (1.0 + relative) + absolute)
         upper[i] = 0.0 if absolute == 0.0 else future * (1.0 + 4.0 * UNIT) + 2.0 * LEAST
 

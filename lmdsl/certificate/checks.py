@@ -25,33 +25,33 @@ MANY = 10_000
 """Cells from which on two claims are judged in two threads."""
 
 
-def check_stabilizing(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
+def check_stabilizing(lp: StabilizationLP, policy: Pairs, w: Floats) -> float | None:
     """Claim 1: return a proved bound on rho(g P_u), None where the claim does not hold.
 
     It is 1 - min d/w < 1 rounded up, which may be 1.
     """
     if not len(w):
         return None
-    d = bounds.decrease(lp, pair, w, lp.growth)
+    d = bounds.decrease(lp, policy, w, lp.growth)
     if d is not None:
         share = float((d / w).min()) * (1 - 4 * bounds.UNIT)
         contraction = float(np.nextafter(1 - share, 2.0))
         if contraction < 1:
             return max(contraction, 0.0)
-    exactly = _extreme(lp, pair, w, lp.growth, None)
-    found = None if exactly is None else exact_sums.contraction(lp, _rows(lp, pair), exactly)
+    exactly = _extreme(lp, policy, w, lp.growth, None)
+    found = None if exactly is None else exact_sums.contraction(lp, _rows(lp, policy), exactly)
     return None if found is None or found >= 1 else rounded_up(found)
 
 
-def check_upper(lp: StabilizationLP, pair: Pairs, V_up: Floats) -> bool:
+def check_upper(lp: StabilizationLP, policy: Pairs, V_up: Floats) -> bool:
     """Claim 2: V_up >= gamma P_u V_up + G_u and V_up >= 0."""
     if not is_sound(lp, V_up):
         return False
-    future = bounds.expected_above(lp, pair, V_up, lp.gamma)
-    if (V_up >= bounds.add_above(future, lp.cost[pair])).all():
+    future = bounds.expected_above(lp, policy, V_up, lp.gamma)
+    if (V_up >= bounds.add_above(future, lp.cost[policy])).all():
         return True
-    V = _extreme(lp, pair, V_up, lp.gamma, lp.cost)
-    return V is not None and exact_sums.above_policy(lp, _rows(lp, pair), pair, V)
+    V = _extreme(lp, policy, V_up, lp.gamma, lp.cost)
+    return V is not None and exact_sums.above_policy(lp, _rows(lp, policy), policy, V)
 
 
 def check_lower(lp: StabilizationLP, W: Floats) -> bool:
@@ -61,7 +61,7 @@ def check_lower(lp: StabilizationLP, W: Floats) -> bool:
     return bounds.holds_for_all(lp, W, lp.gamma, lp.cost)
 
 
-def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> tuple[float, bool]:
+def check_measure(lp: StabilizationLP, policy: Pairs, mu: Floats) -> tuple[float, bool]:
     """Claim 4: return ||m - mu + gamma P_u'mu||_1 rounded up, and whether the claim holds.
 
     The residual is infinite where mu is not >= 0. Where rounding alone decides, or a number
@@ -70,7 +70,7 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> tuple[float, 
     if not is_sound(lp, mu):
         return math.inf, False
     with np.errstate(over="ignore", invalid="ignore"):
-        inflow, relative, absolute = bounds.inflow(lp, pair, mu, lp.gamma)
+        inflow, relative, absolute = bounds.inflow(lp, policy, mu, lp.gamma)
         rounding = relative * (lp.weight + mu + inflow) + absolute
         residual = np.abs((lp.weight - mu) + inflow)
         size = float(mu.sum()) * (1 - 70 * bounds.UNIT)
@@ -79,11 +79,11 @@ def check_measure(lp: StabilizationLP, pair: Pairs, mu: Floats) -> tuple[float, 
     if bound <= allowed < math.inf:
         return bound, True
     least = bound - 2 * total_above(rounding)
-    entries = lp.rows.pointer[pair + 1] - lp.rows.pointer[pair]
+    entries = lp.rows.pointer[policy + 1] - lp.rows.pointer[policy]
     if entries.sum() > MOST_EXACT or allowed < least < math.inf:
         return (bound if math.isfinite(bound) else math.inf), False
     exactly = exact_sums.fractions(mu)
-    found = exact_sums.residual(lp, _rows(lp, pair), exactly)
+    found = exact_sums.residual(lp, _rows(lp, policy), exactly)
     return rounded_up(found), found <= allowed_residual(exactly)
 
 
@@ -103,20 +103,20 @@ def is_sound(lp: StabilizationLP, x: Floats) -> bool:
 
 
 def _extreme(
-    lp: StabilizationLP, pair: Pairs, x: Floats, gamma: float, cost: Floats | None
+    lp: StabilizationLP, policy: Pairs, x: Floats, gamma: float, cost: Floats | None
 ) -> list[Fraction] | None:
     """Return a vector as fractions where the fast check may fail because numbers are extreme.
 
     None where its word is final, or the rows of the policy are too many.
     """
-    entries = lp.rows.pointer[pair + 1] - lp.rows.pointer[pair]
+    entries = lp.rows.pointer[policy + 1] - lp.rows.pointer[policy]
     if not is_sound(lp, x) or bounds.ordinary(lp, x, gamma, cost) or entries.sum() > MOST_EXACT:
         return None
     return exact_sums.fractions(x)
 
 
-def _rows(lp: StabilizationLP, pair: Pairs) -> list[exact_sums.Row]:
-    return [row for _, row in exact_sums.rows(lp, pair)]
+def _rows(lp: StabilizationLP, policy: Pairs) -> list[exact_sums.Row]:
+    return [row for _, row in exact_sums.rows(lp, policy)]
 
 
 def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
@@ -131,15 +131,15 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
     tolerance
         Largest gap that counts as verified.
     """
-    pair = witness.pair
+    policy = witness.policy
     V_up, W, mu, w = witness.V_up, witness.W, witness.mu, witness.w
-    if pair is not None and not is_policy(lp, pair):
-        pair = None
+    if policy is not None and not is_policy(lp, policy):
+        policy = None
     contraction = cost = floor = None
     residual: tuple[float, bool] | None = None
     upper = False
-    if pair is not None:
-        under, own = lp.under(pair), np.arange(lp.n)
+    if policy is not None:
+        under, own = lp.under(policy), np.arange(lp.n)
 
         def of_policy() -> tuple[float | None, bool]:
             proved = None if w is None else check_stabilizing(under, own, w)
@@ -161,7 +161,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
         upper_bound=upper,
         lower_bound=lower,
         measure=residual is not None and residual[1],
-        refusal=pair is None and w is not None and check_refusal(lp, w),
+        refusal=policy is None and w is not None and check_refusal(lp, w),
         contraction=contraction,
         cost=cost if upper else None,
         lower=floor,
@@ -169,7 +169,7 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
         measure_residual=None if residual is None else residual[0],
         tolerance=tolerance,
     )
-    return explained(lp, pair, with_stated_gap(certificate))
+    return explained(lp, policy, with_stated_gap(certificate))
 
 
 def with_stated_gap(proof: Certificate) -> Certificate:
@@ -184,23 +184,23 @@ def weighted(lp: StabilizationLP, values: Floats) -> float:
     return sums.total(lp.weight * values)
 
 
-def is_policy(lp: StabilizationLP, pair: Pairs) -> bool:
+def is_policy(lp: StabilizationLP, policy: Pairs) -> bool:
     """Return whether an array names one column of every cell's own."""
-    if pair.shape != (lp.n,) or not lp.n:
+    if policy.shape != (lp.n,) or not lp.n:
         return False
-    return bool((pair >= lp.pair_pointer[:-1]).all() and (pair < lp.pair_pointer[1:]).all())
+    return bool((policy >= lp.pair_pointer[:-1]).all() and (policy < lp.pair_pointer[1:]).all())
 
 
-def explained(lp: StabilizationLP, pair: Pairs | None, certificate: Certificate) -> Certificate:
+def explained(lp: StabilizationLP, policy: Pairs | None, certificate: Certificate) -> Certificate:
     """Return the certificate with the reasons why it is not verified."""
     reasons = []
     if certificate.refusal:
         reasons.append(f"proved: no policy has finite cost at gamma = {lp.gamma!r}")
-    elif pair is None:
+    elif policy is None:
         reasons.append("there is no policy to verify")
     elif not certificate.stabilizing:
-        reasons.append(_not_stabilizing(lp, pair))
-    if pair is not None:
+        reasons.append(_not_stabilizing(lp, policy))
+    if policy is not None:
         if not certificate.upper_bound:
             reasons.append("no upper bound on the cost of the policy could be established")
         if not certificate.lower_bound:
@@ -234,8 +234,8 @@ def _too_small(cost: float | None) -> str:
     )
 
 
-def _not_stabilizing(lp: StabilizationLP, pair: Pairs) -> str:
-    lost = int((~reachability.reaches_attractor(lp, pair)).sum())
+def _not_stabilizing(lp: StabilizationLP, policy: Pairs) -> str:
+    lost = int((~reachability.reaches_attractor(lp, policy)).sum())
     if lost and lp.gamma < 1:
         return (
             f"from {lost} of {lp.n} cells the policy never reaches the attractor: at gamma = "

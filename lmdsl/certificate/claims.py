@@ -73,7 +73,7 @@ class Witness:
 
     Attributes
     ----------
-    pair
+    policy
         The policy: a column per cell; None where nothing is claimed of one.
     w
         Vector of claim 1, or of the refusal; None where there is none.
@@ -81,7 +81,7 @@ class Witness:
         Vectors of claims 2 to 4; None where not established (W then counts as 0).
     """
 
-    pair: Pairs | None
+    policy: Pairs | None
     w: Floats | None = None
     V_up: Floats | None = None
     W: Floats | None = None

@@ -30,17 +30,19 @@ def check_exactly(
     check
         Called now and then; it may raise.
     """
-    pair = witness.pair if witness.pair is not None and is_policy(lp, witness.pair) else None
+    policy = (
+        witness.policy if witness.policy is not None and is_policy(lp, witness.policy) else None
+    )
     V_up, W, w, mu = (
         exact_sums.fractions(x) if x is not None and is_sound(lp, x) else None
         for x in (witness.V_up, witness.W, witness.w, witness.mu)
     )
-    rows = None if pair is None else [row for _, row in exact_sums.rows(lp, pair, check)]
+    rows = None if policy is None else [row for _, row in exact_sums.rows(lp, policy, check)]
     contraction = cost = floor = residual = gap = None
-    if rows is not None and pair is not None:
+    if rows is not None and policy is not None:
         if w is not None:
             contraction = exact_sums.contraction(lp, rows, w)
-        if V_up is not None and exact_sums.above_policy(lp, rows, pair, V_up):
+        if V_up is not None and exact_sums.above_policy(lp, rows, policy, V_up):
             cost = _mean(lp, V_up)
         if mu is not None:
             residual = exact_sums.residual(lp, rows, mu)
@@ -55,7 +57,7 @@ def check_exactly(
         upper_bound=cost is not None,
         lower_bound=floor is not None,
         measure=residual is not None and mu is not None and residual <= allowed_residual(mu),
-        refusal=pair is None
+        refusal=policy is None
         and w is not None
         and any(w)
         and exact_sums.below_all(lp, w, None, check),
@@ -66,7 +68,7 @@ def check_exactly(
         measure_residual=None if residual is None else rounded_up(residual),
         tolerance=tolerance,
     )
-    return explained(lp, pair, with_stated_gap(certificate))
+    return explained(lp, policy, with_stated_gap(certificate))
 
 
 def _mean(lp: StabilizationLP, values: list[Fraction]) -> Fraction:

@@ -41,11 +41,11 @@ def integers(x: list[Fraction]) -> tuple[list[int], int]:
     return [value.numerator * (2**shift // value.denominator) for value in x], shift
 
 
-def residual(lp: StabilizationLP, policy: Iterable[Row], mu: list[Fraction]) -> Fraction:
+def residual(lp: StabilizationLP, rows: Iterable[Row], mu: list[Fraction]) -> Fraction:
     """Return ||m - mu + gamma P_u'mu||_1 for the rows of a policy."""
     a, shift = integers(mu)
     inflow = [0] * lp.n
-    for i, row in enumerate(policy):
+    for i, row in enumerate(rows):
         for j, s in row:
             inflow[j] += a[i] * s
     rate = Fraction(lp.gamma) / (lp.rows.shares.total * 2**shift)
@@ -60,26 +60,26 @@ def fractions(x: Floats) -> list[Fraction]:
     return [Fraction(value) for value in x.tolist()]
 
 
-def contraction(lp: StabilizationLP, policy: list[Row], w: list[Fraction]) -> Fraction | None:
+def contraction(lp: StabilizationLP, rows: list[Row], w: list[Fraction]) -> Fraction | None:
     """Return max g (P_u w) / w exactly: below 1 it proves claim 1; None unless w > 0."""
     if not all(w):
         return None
     a, _ = integers(w)
     worst = max(
-        (Fraction(sum(a[j] * s for j, s in row), a[i]) for i, row in enumerate(policy)),
+        (Fraction(sum(a[j] * s for j, s in row), a[i]) for i, row in enumerate(rows)),
         default=Fraction(0),
     )
     return Fraction(lp.growth) * worst / lp.rows.shares.total
 
 
-def above_policy(lp: StabilizationLP, policy: list[Row], pair: Pairs, V: list[Fraction]) -> bool:
+def above_policy(lp: StabilizationLP, rows: list[Row], policy: Pairs, V: list[Fraction]) -> bool:
     """Decide V >= gamma P_u V + G_u."""
     a, shift = integers(V)
     scale, total = Fraction(lp.gamma), lp.rows.shares.total
-    cost = lp.cost[pair].tolist()
+    cost = lp.cost[policy].tolist()
     return all(
         a[i] >= scale * sum(a[j] * s for j, s in row) / total + Fraction(cost[i]) * 2**shift
-        for i, row in enumerate(policy)
+        for i, row in enumerate(rows)
     )
 
 

@@ -169,28 +169,28 @@ class StabilizationLP(Frozen):
             weight=self.weight[inside],
         )
 
-    def under(self, pair: NDArray[np.int64]) -> StabilizationLP:
+    def under(self, policy: NDArray[np.int64]) -> StabilizationLP:
         """Return the model under a policy, a column per cell: its only policy is ``arange(n)``."""
-        pair = inputs.indices(pair, self.K, "pair", "columns")
+        policy = inputs.indices(policy, self.K, "policy", "columns")
         if (
-            len(pair) != self.n
-            or not ((pair >= self.pair_pointer[:-1]) & (pair < self.pair_pointer[1:])).all()
+            len(policy) != self.n
+            or not ((policy >= self.pair_pointer[:-1]) & (policy < self.pair_pointer[1:])).all()
         ):
-            raise BadInput("a policy names one column of each cell's own", "pair")
+            raise BadInput("a policy names one column of each cell's own", "policy")
         return replace(
             self,
             pair_pointer=np.arange(self.n + 1, dtype=np.int64),
-            control=self.control[pair],
-            rows=self.rows.take(pair),
-            cost=self.cost[pair],
+            control=self.control[policy],
+            rows=self.rows.take(policy),
+            cost=self.cost[policy],
         )
 
     @property
     def tree(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""
-        level, pair = self._algorithm_1[0].view(), self._algorithm_1[1].view()
-        freeze(level, pair)
-        return level, pair
+        level, policy = self._algorithm_1[0].view(), self._algorithm_1[1].view()
+        freeze(level, policy)
+        return level, policy
 
     @cached_property
     def _algorithm_1(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
@@ -317,7 +317,7 @@ def compile(  # noqa: A001
         if isinstance(array.base, np.ndarray):
             freeze(array.base)
     # The search that found C ends with Algorithm 1 on the surviving pairs.
-    pair = found.pair[found.inside]
-    column = pair if isinstance(kept, slice) else np.searchsorted(kept, pair)
+    policy = found.pair[found.inside]
+    column = policy if isinstance(kept, slice) else np.searchsorted(kept, policy)
     vars(lp)["_algorithm_1"] = found.level[found.inside], column
     return lp

@@ -43,7 +43,7 @@ gamma (1 + s) leaves a slack s gamma P V relative to V above; the optimum at gam
 
 def certify(
     lp: StabilizationLP,
-    pair: Pairs,
+    policy: Pairs,
     tolerance: float,
     value: Floats | None = None,
     stop: Stop = never,
@@ -52,7 +52,7 @@ def certify(
 
     Parameters
     ----------
-    lp, pair
+    lp, policy
         The finite model and one column per cell.
     tolerance
         Largest gap that counts as verified.
@@ -62,9 +62,9 @@ def certify(
         Ends the work; what is not established by then is not claimed.
     """
     try:
-        witness, V = _first_try(lp, pair, tolerance, value, stop)
+        witness, V = _first_try(lp, policy, tolerance, value, stop)
     except Stopped:
-        witness, V = Witness(pair), None
+        witness, V = Witness(policy), None
     proof = check(lp, witness, tolerance)
     if V is not None and (proof.gap is None or proof.gap > tolerance):
         witness = _tightened(lp, witness, V, tolerance, stop)
@@ -73,10 +73,10 @@ def certify(
 
 
 def _first_try(
-    lp: StabilizationLP, pair: Pairs, tolerance: float, value: Floats | None, stop: Stop
+    lp: StabilizationLP, policy: Pairs, tolerance: float, value: Floats | None, stop: Stop
 ) -> tuple[Witness, Floats | None]:
     """Return vectors that serve as a rule, and the policy's value."""
-    under, own = lp.under(pair), np.arange(lp.n)
+    under, own = lp.under(policy), np.arange(lp.n)
     rows = evaluation.peeled(under, own, lp.gamma)
     growing = rows if lp.growth == lp.gamma else None
 
@@ -86,8 +86,10 @@ def _first_try(
         if V is None:
             V = evaluation.evaluate(under, own, transient=w is not None, stop=stop, rows=rows)
         if V is None:
-            return Witness(pair, w, None, lower_vector(lp, None, tolerance, stop), None), None
-        return Witness(pair, w, upper_vector(under, own, V, w, d), _guessed(under, V, tolerance)), V
+            return Witness(policy, w, None, lower_vector(lp, None, tolerance, stop), None), None
+        return Witness(
+            policy, w, upper_vector(under, own, V, w, d), _guessed(under, V, tolerance)
+        ), V
 
     def measure() -> Floats | None:
         return _measure_vector(under, rows, stop)
@@ -104,16 +106,16 @@ def _tightened(
     lp: StabilizationLP, witness: Witness, V: Floats, tolerance: float, stop: Stop
 ) -> Witness:
     """Bring the bounds of the cost together, where the first try did not."""
-    pair, V_up, W = witness.pair, witness.V_up, _scaled(lp, V)
-    assert pair is not None
+    policy, V_up, W = witness.policy, witness.V_up, _scaled(lp, V)
+    assert policy is not None
     W = np.zeros(lp.n) if W is None else W
     best = gap(lp, V_up, W)
     for slack in RELATIVE_SLACK:
         if best <= tolerance:
             break
         try:
-            V_up = _lesser(lp, V_up, _upper_with_slack(lp, pair, slack, stop))
-            W = _greater(lp, W, _lower_with_slack(lp, pair, V, slack, stop))
+            V_up = _lesser(lp, V_up, _upper_with_slack(lp, policy, slack, stop))
+            W = _greater(lp, W, _lower_with_slack(lp, policy, V, slack, stop))
         except Stopped:
             break
         best = gap(lp, V_up, W)
@@ -122,19 +124,21 @@ def _tightened(
     return replace(witness, V_up=V_up, W=W)
 
 
-def _upper_with_slack(lp: StabilizationLP, pair: Pairs, slack: float, stop: Stop) -> Floats | None:
-    V = evaluation.evaluate(lp, pair, lp.gamma * (1 + slack), stop=stop)
-    return V if V is not None and check_upper(lp, pair, V) else None
+def _upper_with_slack(
+    lp: StabilizationLP, policy: Pairs, slack: float, stop: Stop
+) -> Floats | None:
+    V = evaluation.evaluate(lp, policy, lp.gamma * (1 + slack), stop=stop)
+    return V if V is not None and check_upper(lp, policy, V) else None
 
 
 def _lower_with_slack(
-    lp: StabilizationLP, pair: Pairs, V: Floats, slack: float, stop: Stop
+    lp: StabilizationLP, policy: Pairs, V: Floats, slack: float, stop: Stop
 ) -> Floats | None:
     gamma = lp.gamma * (1 - slack)
-    value = evaluation.evaluate(lp, pair, gamma, start=V, stop=stop)
+    value = evaluation.evaluate(lp, policy, gamma, start=V, stop=stop)
     if value is None:
         return None
-    W = iteration.iterate(lp, pair, value, gamma, stop=stop, limit=20).value
+    W = iteration.iterate(lp, policy, value, gamma, stop=stop, limit=20).value
     return W if check_lower(lp, W) else None
 
 
@@ -148,7 +152,7 @@ def _greater(lp: StabilizationLP, a: Floats, b: Floats | None) -> Floats:
 
 
 def upper_vector(
-    lp: StabilizationLP, pair: Pairs, V: Floats, w: Floats | None, d: Floats | None
+    lp: StabilizationLP, policy: Pairs, V: Floats, w: Floats | None, d: Floats | None
 ) -> Floats | None:
     """Return V_up = V + delta w with delta >= max(residual / d), None where it fails."""
     if not np.isfinite(V).all() or not (V >= 0).all():
@@ -156,8 +160,8 @@ def upper_vector(
     if (w is None or d is None) and lp.gamma < 1:
         w, d = np.ones(lp.n), np.full(lp.n, (1 - lp.gamma) * 0.99)
     for _ in range(4):
-        future = bounds.expected_above(lp, pair, V, lp.gamma)
-        residual = bounds.add_above(future, lp.cost[pair]) - V
+        future = bounds.expected_above(lp, policy, V, lp.gamma)
+        residual = bounds.add_above(future, lp.cost[policy]) - V
         if (residual <= 0).all():
             return V
         if w is None or d is None:
@@ -166,7 +170,7 @@ def upper_vector(
         V = V + delta * w
         if not np.isfinite(V).all():
             return None
-    return V if check_upper(lp, pair, V) else None
+    return V if check_upper(lp, policy, V) else None
 
 
 def lower_vector(

@@ -145,8 +145,8 @@ class _Job:
             return lp.expand(np.asarray(known, dtype=np.float64), attractor, outside)
 
         index = np.full(lp.partition.size, -1, dtype=np.int32)
-        if witness.pair is not None:
-            index[lp.cells] = lp.control[witness.pair]
+        if witness.policy is not None:
+            index[lp.cells] = lp.control[witness.policy]
         solved = status != "not_stabilizable"
         attractor = lp.cell_status == CellStatus.ATTRACTOR
         local = LocalController.of(lp.problem, lp.partition, attractor)

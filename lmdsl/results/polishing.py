@@ -21,7 +21,7 @@ from lmdsl.optimize.witness import certify
 class _Outcome:
     """A policy after polishing, and what polishing did."""
 
-    pair: Pairs
+    policy: Pairs
     value: NDArray[np.float64] | None
     steps: int
     gap_before: float | None
@@ -29,10 +29,10 @@ class _Outcome:
 
 def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
     """Return the policy of a solution: its own, else greedy in V, else largest occupation."""
-    if solution.pair is not None:
-        return solution.pair
+    if solution.policy is not None:
+        return solution.policy
     if solution.value is not None:
-        return bellman.improve(lp, np.maximum(solution.value, 0.0)).pair
+        return bellman.improve(lp, np.maximum(solution.value, 0.0)).policy
     if solution.occupation is not None:
         theta = solution.occupation
         top = np.maximum.reduceat(theta, lp.pair_pointer[:-1])
@@ -55,24 +55,24 @@ def _polish(
     """
     if iteration is not None and solution.stop.success:  # it ends where polishing would begin
         return _tidied(lp, iteration, tolerance, 0, None, stop)
-    pair = _claimed(lp, solution)
-    if pair is not None and not _usable(lp, pair, solution.value):
-        pair = None
-    if pair is None:
-        pair = start
-    guess = None if solution.pair is None else solution.value
+    policy = _claimed(lp, solution)
+    if policy is not None and not _usable(lp, policy, solution.value):
+        policy = None
+    if policy is None:
+        policy = start
+    guess = None if solution.policy is None else solution.value
     try:
         value = evaluation.evaluate(
-            lp, pair, start=guess, transient=lp.gamma >= 1, stop=stop.again()
+            lp, policy, start=guess, transient=lp.gamma >= 1, stop=stop.again()
         )
     except Stopped:
         value = None
     if value is None or solution.stop.limit:
-        return _Outcome(pair, value, 0, None)
-    done = iterate(lp, pair, value, stop=stop)
+        return _Outcome(policy, value, 0, None)
+    done = iterate(lp, policy, value, stop=stop)
     gap_before = None
     if done.steps:
-        gap_before = certify(lp, pair, tolerance, value, stop.again()).certificate.gap
+        gap_before = certify(lp, policy, tolerance, value, stop.again()).certificate.gap
     return _tidied(lp, done, tolerance, done.steps, gap_before, stop)
 
 
@@ -86,17 +86,17 @@ def _tidied(
 ) -> _Outcome:
     """Break ties; where that costs more than the tolerance the strict minimisers stay."""
     try:
-        tidy = ties.canonical(lp, done.pair, done.value, done.screen, stop)
+        tidy = ties.canonical(lp, done.policy, done.value, done.screen, stop)
     except Stopped:
-        tidy = done.pair
-    if (tidy != done.pair).any() and _usable(lp, tidy, done.value):
+        tidy = done.policy
+    if (tidy != done.policy).any() and _usable(lp, tidy, done.value):
         tidy_value = evaluation.evaluate(lp, tidy, start=done.value, transient=lp.gamma >= 1)
         limit = (1 + tolerance / 4) * checks.weighted(lp, done.value)
         if tidy_value is not None and checks.weighted(lp, tidy_value) <= limit:
             return _Outcome(tidy, tidy_value, steps, gap_before)
     value = done.value if done.converged else None  # else perhaps only a bound of it
-    return _Outcome(done.pair, value, steps, gap_before)
+    return _Outcome(done.policy, value, steps, gap_before)
 
 
-def _usable(lp: StabilizationLP, pair: Pairs, guess: NDArray[np.float64] | None) -> bool:
-    return lp.gamma < 1 or evaluation.stability_vector(lp, pair, guess)[0] is not None
+def _usable(lp: StabilizationLP, policy: Pairs, guess: NDArray[np.float64] | None) -> bool:
+    return lp.gamma < 1 or evaluation.stability_vector(lp, policy, guess)[0] is not None

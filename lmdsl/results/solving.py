@@ -120,13 +120,13 @@ def solve(
             bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
             message = restriction.refusal_message(lp, w, limits, bracket)
             return job.refused("gamma", message, verified, bracket)
-        first = first_policy.Undecided(first.best.pair, first.lower)
+        first = first_policy.Undecided(first.best.policy, first.lower)
     options = Options(
         tolerance=tolerance,
         time_limit=late.left,
         max_iterations=max_iterations,
         algorithm=algorithm,
-        start=first.pair,
+        start=first.policy,
         proof=first.w if isinstance(first, first_policy.Feasible) else None,
         progress=progress,
     )
@@ -134,19 +134,19 @@ def solve(
     if isinstance(first, first_policy.Undecided):
         word = "time limit" if late() else "undecided"
         stop = Stop.TIME_LIMIT if late() else Stop.FAILED
-        solution = Solution(stop, word, pair=first.pair)
+        solution = Solution(stop, word, policy=first.policy)
     else:
         if progress:
             progress("solve", -1.0)
         solution, iteration, job.log = ask(lp, chosen, options)
-    outcome = _polish(lp, solution, iteration, first.pair, tolerance, late)
+    outcome = _polish(lp, solution, iteration, first.policy, tolerance, late)
     iteration = None  # the rows of its last policy would stay till the end
     job.solve_seconds = time.perf_counter() - started
     if progress:
         progress("verify", -1.0)
     started = time.perf_counter()
     job.finish = late.again()
-    verified = certify(lp, outcome.pair, tolerance, outcome.value, job.finish)
+    verified = certify(lp, outcome.policy, tolerance, outcome.value, job.finish)
     job.verify_seconds = time.perf_counter() - started
     undecided = isinstance(first, first_policy.Undecided) and not late()
     return job.solved(solution, outcome, verified, undecided)

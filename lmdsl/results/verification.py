@@ -179,12 +179,12 @@ def recompiled(
 def _judge_claims(
     lp: StabilizationLP, result: Result, reasons: list[str], judge: Judge
 ) -> Certificate:
-    pair = _policy(lp, result)
-    if pair is None:
+    policy = _policy(lp, result)
+    if policy is None:
         reasons.append("control_index is no policy on the stabilizable set")
     on = lp.cells
     V_up, W = result.value[on], result.lower[on]
-    witness = Witness(pair, result.witness[on], V_up, W, result.measure[on])
+    witness = Witness(policy, result.witness[on], V_up, W, result.measure[on])
     certificate = judge(lp, witness, result.tolerance or 0.0)
     reasons += certificate.reasons
     return certificate
@@ -212,10 +212,10 @@ def _policy(lp: StabilizationLP, result: Result) -> np.ndarray[Any, Any] | None:
     M = len(lp.controls)
     key = lp.cell.astype(np.int64) * M + lp.control
     target = np.arange(lp.n, dtype=np.int64) * M + wanted
-    pair = np.minimum(np.searchsorted(key, target), max(lp.K - 1, 0))
-    if not lp.K or (wanted < 0).any() or (key[pair] != target).any():
+    policy = np.minimum(np.searchsorted(key, target), max(lp.K - 1, 0))
+    if not lp.K or (wanted < 0).any() or (key[policy] != target).any():
         return None
-    return pair
+    return policy
 
 
 def _stored_model(path: str | os.PathLike[str], result: Result) -> StabilizationLP:

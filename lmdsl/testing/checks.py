@@ -94,11 +94,11 @@ def policy(probe: Probe) -> None:
     """The policy takes one column of each cell's own, and its cost-to-go is V."""
     for one in BY_HAND:
         lp, found = probe.claimed(one)
-        if found.pair is None:
+        if found.policy is None:
             raise Unjudged("no policy is given")
-        if not owned(lp, found.pair):
+        if not owned(lp, found.policy):
             raise Broken(f"a column of another cell is taken on the LP {one.name}")
-        error = np.abs(cost_to_go(lp, found.pair) - one.value).max() / one.value.max()
+        error = np.abs(cost_to_go(lp, found.policy) - one.value).max() / one.value.max()
         if not error <= ACCURACY:
             raise Broken(f"the policy costs {error:.1e} relative too much on the LP {one.name}")
 
@@ -277,7 +277,7 @@ def deterministic(probe: Probe) -> None:
     """Asked twice it gives the same bytes."""
     for one in (known.walk(60), known.tie(1.0)):
         first, second = probe.answer(one)[1], probe.ask(one.compile())
-        for name in ("value", "occupation", "pair"):
+        for name in ("value", "occupation", "policy"):
             a, b = getattr(first, name), getattr(second, name)
             if (a is None) != (b is None) or (a is not None and a.tobytes() != b.tobytes()):
                 raise Broken(f"{name} differs from one time to the next on the LP {one.name}")

@@ -128,7 +128,7 @@ def misshapen(lp: StabilizationLP, found: Any) -> str | None:
         return f"word is a {type(found.word).__name__}, not a text"
     if not isinstance(found.iterations, int | np.integer | None):
         return f"iterations is a {type(found.iterations).__name__}, not a whole number"
-    parts = (("value", lp.n, "f"), ("occupation", lp.K, "f"), ("pair", lp.n, "iu"))
+    parts = (("value", lp.n, "f"), ("occupation", lp.K, "f"), ("policy", lp.n, "iu"))
     given = 0
     for name, count, kinds in parts:
         array = getattr(found, name)
@@ -144,7 +144,7 @@ def misshapen(lp: StabilizationLP, found: Any) -> str | None:
         if found.stop.success and not np.isfinite(array).all():
             return f"{name} is not finite"
     if found.stop.success and not given:
-        return f"{found.stop.name} comes without value, occupation and pair"
+        return f"{found.stop.name} comes without value, occupation and policy"
     return None
 
 
@@ -160,8 +160,8 @@ def judge(
     top = float(known.value.max()) or 1.0
     if found.value is not None:
         error = float(np.abs(np.abs(found.value) - known.value).max()) / top
-    elif found.pair is not None and owned(lp, found.pair):
-        error = float(np.abs(cost_to_go(lp, found.pair) - known.value).max()) / top
+    elif found.policy is not None and owned(lp, found.policy):
+        error = float(np.abs(cost_to_go(lp, found.policy) - known.value).max()) / top
     elif found.occupation is not None:
         error = abs(float(lp.c @ found.occupation) - known.optimum(lp)) / top
     else:
@@ -170,15 +170,15 @@ def judge(
         raise Broken(f"the value is off by {error:.1e} relative on the LP {known.name}")
 
 
-def owned(lp: StabilizationLP, pair: NDArray[Any]) -> bool:
+def owned(lp: StabilizationLP, policy: NDArray[Any]) -> bool:
     """Return whether a policy, shape (n,), names one column of each cell's own."""
-    return bool(((pair >= lp.pair_pointer[:-1]) & (pair < lp.pair_pointer[1:])).all())
+    return bool(((policy >= lp.pair_pointer[:-1]) & (policy < lp.pair_pointer[1:])).all())
 
 
-def cost_to_go(lp: StabilizationLP, pair: NDArray[Any]) -> Floats:
+def cost_to_go(lp: StabilizationLP, policy: NDArray[Any]) -> Floats:
     """Return V = G_u + gamma P_u V of a policy by dense algebra, infinite where it has none."""
-    M = lp.gamma * lp.P.toarray()[pair]
+    M = lp.gamma * lp.P.toarray()[policy]
     if max(abs(np.linalg.eigvals(M))) >= 1:
         return np.full(lp.n, np.inf)
-    V: Floats = np.linalg.solve(np.eye(lp.n) - M, lp.cost[pair])
+    V: Floats = np.linalg.solve(np.eye(lp.n) - M, lp.cost[policy])
     return V

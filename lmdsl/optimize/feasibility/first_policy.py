@@ -32,7 +32,7 @@ NEAR = 64
 class Feasible:
     """A g-stabilizing policy, and a proof of it: w > 0 with w > g P_u w."""
 
-    pair: Pairs
+    policy: Pairs
     w: Floats
 
 
@@ -52,24 +52,24 @@ class Refused:
 class Undecided:
     """gamma is so close to its limit that doubles decide neither way, or time ran out.
 
-    ``pair`` is a policy that is stabilizing at ``lower`` < gamma.
+    ``policy`` is a policy that is stabilizing at ``lower`` < gamma.
     """
 
-    pair: Pairs
+    policy: Pairs
     lower: float
 
 
-def _proved(lp: StabilizationLP, pair: Pairs, w: Floats, stop: Stop) -> Floats | None:
+def _proved(lp: StabilizationLP, policy: Pairs, w: Floats, stop: Stop) -> Floats | None:
     """Make of a guess a proof that a policy is g-stabilizing; None where it takes too long.
 
     Where its own value is soon known and every cost positive, it is the proof; else the guess is
     swept towards the unit-cost value, as long as that is in sight. Else 1 serves where all rows
     lose mass.
     """
-    rows, cost = peeled(lp, pair, lp.growth), lp.cost[pair]
+    rows, cost = peeled(lp, policy, lp.growth), lp.cost[policy]
 
     def proves(guess: Floats) -> bool:
-        return bounds.decrease(lp, pair, guess, lp.growth) is not None
+        return bounds.decrease(lp, policy, guess, lp.growth) is not None
 
     def even() -> Floats | None:
         ones = np.ones(lp.n)
@@ -116,23 +116,23 @@ def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused |
 def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | Undecided]:
     """Raise gamma step by step; yield what is known after each, the decision last."""
     g = lp.growth
-    level, pair = lp._algorithm_1
+    level, policy = lp._algorithm_1
     V = level.astype(np.float64)
     for k in range(4 if level.max() <= NEAR else 0):
         better = bellman.rise(lp, V, g, k % 2 == 1)
         V = better.value
-        w = _proved(lp, better.pair, V, stop) if k in (0, 3) else None
+        w = _proved(lp, better.policy, V, stop) if k in (0, 3) else None
         if w is not None:
-            yield Feasible(better.pair, w)
+            yield Feasible(better.policy, w)
             return
     unit, asked = np.ones(lp.K), g == 1
     for horizon in (4.0 * level.max(), 64.0 * level.max()):
         at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
         for _ in range(4):
-            done = iterate(lp, pair, value, at, unit, stop=stop, limit=6)
-            pair, value = done.pair, done.value
-            w = _proved(lp, pair, value, stop)
-            yield Undecided(pair, at) if w is None else Feasible(pair, w)
+            done = iterate(lp, policy, value, at, unit, stop=stop, limit=6)
+            policy, value = done.policy, done.value
+            w = _proved(lp, policy, value, stop)
+            yield Undecided(policy, at) if w is None else Feasible(policy, w)
             if stop():
                 return
             if not asked:
@@ -143,12 +143,12 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
             if done.converged:
                 break
     for _ in range(200):
-        done = iterate(lp, pair, value, at, unit, stop=stop)
-        pair, value = done.pair, done.value
-        yield Undecided(pair, at)
-        w, _ = stability_vector(lp, pair, stop=stop)
+        done = iterate(lp, policy, value, at, unit, stop=stop)
+        policy, value = done.policy, done.value
+        yield Undecided(policy, at)
+        w, _ = stability_vector(lp, policy, stop=stop)
         if w is not None:
-            yield Feasible(pair, w)
+            yield Feasible(policy, w)
             return
         if stop():
             return
@@ -158,11 +158,11 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
         while raised is None and reach > at * (1 + 1e-13):
             far = reach > 4 * at
             reach = math.sqrt(at) * math.sqrt(reach) if far else at + (reach - at) / 2
-            raised, _ = stability_vector(lp, pair, g=reach, stop=stop)
+            raised, _ = stability_vector(lp, policy, g=reach, stop=stop)
         if raised is None:
             return
         at, value = reach, raised
-        yield Undecided(pair, at)
+        yield Undecided(policy, at)
 
 
 def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
@@ -175,13 +175,13 @@ def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
     best = slowest_growth.improved(lp, spectral_radius.short_lived(lp, stop), stop, lp.gamma)
     for slack in (1e-6, 1e-9, 1e-12, 0.0):
         if best.limit > lp.gamma:
-            w, _ = stability_vector(lp, best.pair, stop=stop)
+            w, _ = stability_vector(lp, best.policy, stop=stop)
             if w is not None:
-                return Feasible(best.pair, w)
+                return Feasible(best.policy, w)
         at = lp.gamma * (1 - slack)
         going = best.rate * at < 1 - 1e-12
         reward = np.where(going, 1.0, best.x)
-        found = optimal_stopping(lp, at, reward, best.pair, going, stop)
+        found = optimal_stopping(lp, at, reward, best.policy, going, stop)
         if found is None:
             break
         if found.refuses:
@@ -190,6 +190,6 @@ def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
             w = found.w if bounds.holds_for_all(lp, found.w, lp.gamma, None) else found.carried
             return Refused(w, best, low)
         if found.going.all():
-            better = spectral_radius.of_policy(lp, found.pair, stop)
+            better = spectral_radius.of_policy(lp, found.policy, stop)
             best = better if better.limit > best.limit else best
-    return Undecided(best.pair, 0.0)
+    return Undecided(best.policy, 0.0)

@@ -64,7 +64,7 @@ class GammaBar(Frozen):
     low, high
         gamma_bar lies in [low, high]; both infinite when the graph test says so, high infinite
         alone when no upper bound was found.
-    pair
+    policy
         A policy that is gamma-stabilizing for every gamma < low: a column per cell of C.
     w_low
         w > 0 with low P_u w <= w, shape (n,); None where gamma_bar is infinite.
@@ -84,7 +84,7 @@ class GammaBar(Frozen):
 
     low: float
     high: float
-    pair: Pairs
+    policy: Pairs
     w_low: Floats | None
     w_high: Floats | None
     note: str = ""
@@ -223,8 +223,8 @@ def _inside(search: _Search, low: float, high: float) -> bool:
 class _Search:
     """The bracket while it narrows: both ends, their vectors, and the best policy so far."""
 
-    def __init__(self, lp: StabilizationLP, stop: Stop, pair: Pairs, width: float) -> None:
-        self.lp, self.stop, self.pair, self.width = lp, stop, pair, width
+    def __init__(self, lp: StabilizationLP, stop: Stop, policy: Pairs, width: float) -> None:
+        self.lp, self.stop, self.policy, self.width = lp, stop, policy, width
         self.steps = (0.1 * width, 0.4 * width, *(x for x in FARTHER if x > width))
         self.low, self.high = 0.0, math.inf
         self.w_low: Floats | None = None
@@ -283,7 +283,7 @@ class _Search:
         proved = spectral_radius.prove_low(self.lp, best)
         if proved is not None and proved[0] > self.low:
             self.low, self.w_low = proved
-            self.pair = best.pair
+            self.policy = best.policy
 
     def _take(self, high: float | None, w: Floats, anyway: bool = False) -> None:
         if high is not None and (high < self.high or anyway):
@@ -301,5 +301,5 @@ class _Search:
             core, high = _core(lp, self.best, self.w_high, high, most, self.stop)
             beyond, limiting = (Area.of(lp.partition, lp.cells[w > 0]) for w in (self.w_high, core))
         return GammaBar(
-            self.low, high, self.pair, self.w_low, self.w_high, note, beyond, limiting, lp.n
+            self.low, high, self.policy, self.w_low, self.w_high, note, beyond, limiting, lp.n
         )

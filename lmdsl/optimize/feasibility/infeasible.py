@@ -37,9 +37,9 @@ def check_high(lp: StabilizationLP, w: Floats) -> float | None:
 def exhausted_by_levels(lp: StabilizationLP) -> Pairs | None:
     """Return a policy that reaches A within n steps surely, None where there is none."""
     before = lp.predecessors
-    pair = np.full(lp.n, -1, dtype=np.int64)
-    _sure_levels(before.pointer, before.pair, lp.rows.pointer, lp.rows.target, lp.cell, pair)
-    return pair if (pair >= 0).all() else None
+    policy = np.full(lp.n, -1, dtype=np.int64)
+    _sure_levels(before.pointer, before.pair, lp.rows.pointer, lp.rows.target, lp.cell, policy)
+    return policy if (policy >= 0).all() else None
 
 
 def _climbed(lp: StabilizationLP, start: Growth, stop: Stop) -> Growth:
@@ -47,13 +47,13 @@ def _climbed(lp: StabilizationLP, start: Growth, stop: Stop) -> Growth:
     unit = np.ones(lp.K)
     for below in (1e-3, 0.1):
         at = start.limit * (1 - below)
-        value = evaluation.evaluate(lp, start.pair, at, unit, stop=stop)
+        value = evaluation.evaluate(lp, start.policy, at, unit, stop=stop)
         if value is None:
             continue
-        done = iteration.iterate(lp, start.pair, value, at, unit, stop=stop)
+        done = iteration.iterate(lp, start.policy, value, at, unit, stop=stop)
         if not done.steps:
             return start
-        found = spectral_radius.of_policy(lp, done.pair, stop)
+        found = spectral_radius.of_policy(lp, done.policy, stop)
         return found if found.limit > start.limit else start
     return start
 
@@ -71,11 +71,11 @@ def _beyond(
     if inside is not None:
         reward, going = np.where(inside, reward, 0.0), going & inside
     limit = 1000 if inside is None else DODGES
-    found = stopping.optimal_stopping(lp, gamma, reward, start.pair, going, stop, limit)
+    found = stopping.optimal_stopping(lp, gamma, reward, start.policy, going, stop, limit)
     if found is None:
         return None
     if not found.refuses:
-        better = spectral_radius.of_policy(lp, found.pair, stop) if found.going.all() else None
+        better = spectral_radius.of_policy(lp, found.policy, stop) if found.going.all() else None
         return better if better is not None and better.limit > start.limit else None
     # Small entries may be rounding, or what carries a vector that falls over many decades.
     for w in (found.carried, found.w):
@@ -115,9 +115,9 @@ def _core(
 
 
 @kernel(allocates=True)
-def _sure_levels(before_pointer, before_pair, pointer, target, cell, pair):  # type: ignore[no-untyped-def]
+def _sure_levels(before_pointer, before_pair, pointer, target, cell, policy):  # type: ignore[no-untyped-def]
     """Peel off cells with a pair all of whose successors are in A or peeled off before."""
-    n = len(pair)
+    n = len(policy)
     waits = np.empty(len(cell), dtype=np.int32)
     for k in range(len(cell)):
         waits[k] = pointer[k + 1] - pointer[k]
@@ -130,7 +130,7 @@ def _sure_levels(before_pointer, before_pair, pointer, target, cell, pair):  # t
         for e in range(before_pointer[j], before_pointer[j + 1]):
             k = before_pair[e]
             waits[k] -= 1
-            if waits[k] == 0 and pair[cell[k]] < 0:
-                pair[cell[k]] = k
+            if waits[k] == 0 and policy[cell[k]] < 0:
+                policy[cell[k]] = k
                 queue[end] = cell[k]
                 end += 1

@@ -59,7 +59,7 @@ def improved(
             elif found.known <= FINE:
                 break
             if gain < least and found.known > FINE:
-                found = of_policy(lp, found.pair, stop, found.x, FINE, inside)
+                found = of_policy(lp, found.policy, stop, found.x, FINE, inside)
             if 0 < gain < least:
                 break
     return found
@@ -74,8 +74,8 @@ def _greedy(
     change = best.value < (found.P @ w) * (1 - SLIGHT)
     if not change.any():
         return None
-    pair = np.where(change, best.pair, found.pair)
-    new = of_policy(lp, pair, stop, found.x, enough, inside)
+    policy = np.where(change, best.policy, found.policy)
+    new = of_policy(lp, policy, stop, found.x, enough, inside)
     if new.limit <= found.limit * (1 + enough):
-        return of_policy(lp, pair, stop, new.x, FINE, inside)
+        return of_policy(lp, policy, stop, new.x, FINE, inside)
     return new

@@ -62,7 +62,7 @@ class Growth:
 
     Attributes
     ----------
-    pair
+    policy
         A column per cell.
     P
         Its rows, CSR, shape (n, n).
@@ -76,7 +76,7 @@ class Growth:
         How well the largest rates are known, relative.
     """
 
-    pair: Pairs
+    policy: Pairs
     P: Any
     order: NDArray[np.int64]
     ends: NDArray[np.int64]
@@ -104,7 +104,7 @@ class Growth:
 
 def of_policy(
     lp: StabilizationLP,
-    pair: Pairs,
+    policy: Pairs,
     stop: Stop = never,
     start: Floats | None = None,
     enough: float = FINE,
@@ -114,14 +114,14 @@ def of_policy(
 
     Parameters
     ----------
-    lp, pair, stop
+    lp, policy, stop
         The model, a column per cell, and what ends the work.
     start, enough
         A guess of x, and how well the rates have to be known, relative.
     inside
         Cells that alone count: runs that leave them end.
     """
-    P = lp.rows.matrix(pair)
+    P = lp.rows.matrix(policy)
     if inside is not None:
         P.data[~(inside[P.indices] & np.repeat(inside, np.diff(P.indptr)))] = 0.0
         P.eliminate_zeros()
@@ -138,7 +138,7 @@ def of_policy(
             P[cells][:, cells], stop, slowest, directions, begin, enough
         )
         slowest = max(slowest, least)
-    return Growth(pair, P, order, ends, x, rate, enough)
+    return Growth(policy, P, order, ends, x, rate, enough)
 
 
 def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
@@ -148,7 +148,7 @@ def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
     last under the policy that comes out, as on long ways, the optimum under unit cost, discounted,
     may be better, or the policy of the levels.
     """
-    level, pair = lp._algorithm_1
+    level, policy = lp._algorithm_1
     horizon = float(HORIZON * level.max())
 
     def candidates() -> Iterator[tuple[Pairs, Floats | None]]:
@@ -156,11 +156,11 @@ def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
         for _ in range(PASSES):
             done = bellman.improve(lp, w, 1.0, zero)
             w = done.value
-        yield done.pair, None
+        yield done.policy, None
         unit, value = np.ones(lp.K), np.full(lp.n, horizon)
-        found = iteration.iterate(lp, pair, value, 1 - 1 / horizon, unit, stop=stop)
-        yield found.pair, found.value
-        yield pair, None
+        found = iteration.iterate(lp, policy, value, 1 - 1 / horizon, unit, stop=stop)
+        yield found.policy, found.value
+        yield policy, None
 
     best: Growth | None = None
     for candidate, start in candidates():
@@ -257,7 +257,7 @@ def _solved(M: Any, x: Floats, stop: Stop, directions: Directions | None) -> Flo
 def prove_low(lp: StabilizationLP, found: Growth) -> tuple[float, Floats] | None:
     """Return a proved low of a policy and its w."""
     w = lifted(found)
-    low = None if w is None else check_low(lp, found.pair, w)
+    low = None if w is None else check_low(lp, found.policy, w)
     return None if w is None or low is None else (low, w)
 
 
@@ -280,11 +280,11 @@ def lifted(found: Growth) -> Floats | None:
     return w
 
 
-def check_low(lp: StabilizationLP, pair: Pairs, w: Floats) -> float | None:
+def check_low(lp: StabilizationLP, policy: Pairs, w: Floats) -> float | None:
     """Return the largest low (rounded down) with low P_u w <= w, None where w > 0 fails."""
     if not (np.isfinite(w).all() and (w > 0).all()):
         return None
-    ahead = bounds.expected_above(lp, pair, w, 1.0)
+    ahead = bounds.expected_above(lp, policy, w, 1.0)
     with np.errstate(divide="ignore", over="ignore"):
         ratio = np.where(ahead > 0, np.minimum(w / ahead, sys.float_info.max), np.inf)
     return float(ratio.min()) * (1 - 4 * bounds.UNIT)

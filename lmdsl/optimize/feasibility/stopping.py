@@ -24,7 +24,7 @@ class Stopping:
     ----------
     w
         The greatest solution of w = min(reward, gamma min_a P_a w), shape (n,).
-    pair
+    policy
         A column for every cell; it counts where ``going``.
     going
         Cells that do not stop.
@@ -33,7 +33,7 @@ class Stopping:
     """
 
     w: Floats
-    pair: Pairs
+    policy: Pairs
     going: Bools
     converged: bool
 
@@ -52,7 +52,7 @@ def optimal_stopping(
     lp: StabilizationLP,
     gamma: float,
     reward: Floats,
-    pair: Pairs | None = None,
+    policy: Pairs | None = None,
     going: Bools | None = None,
     stop: Stop = never,
     limit: int = 1000,
@@ -69,15 +69,15 @@ def optimal_stopping(
         The model and the weight.
     reward
         Shape (n,), >= 0.
-    pair, going
+    policy, going
         A first policy, transient under gamma P on the cells that go; default: stop everywhere.
     stop, limit
         End the work, with None; largest number of steps.
     """
-    pair = lp.pair_pointer[:-1].copy() if pair is None else pair
+    policy = lp.pair_pointer[:-1].copy() if policy is None else policy
     going = np.zeros(lp.n, dtype=np.bool_) if going is None else going
     try:
-        return _stopping(lp, gamma, reward, pair, going, stop, limit)
+        return _stopping(lp, gamma, reward, policy, going, stop, limit)
     except Stopped:
         return None
 
@@ -86,44 +86,44 @@ def _stopping(
     lp: StabilizationLP,
     gamma: float,
     reward: Floats,
-    pair: Pairs,
+    policy: Pairs,
     going: Bools,
     stop: Stop,
     limit: int,
 ) -> Stopping:
     zero = np.zeros(lp.K)
-    w = _stopped(lp, gamma, reward, pair, going, reward, stop)
+    w = _stopped(lp, gamma, reward, policy, going, reward, stop)
     if w is None:
         going = np.zeros(lp.n, dtype=np.bool_)
         w = reward
     for step in range(limit):
         if stop():
             raise Stopped
-        lowered, new_pair, new_going = w, pair, going
+        lowered, new_pair, new_going = w, policy, going
         for _ in range(step + 1):
             better = bellman.improve(lp, lowered, gamma, zero)
             least = np.minimum(better.value, reward)
-            same = np.where(better.value <= reward, new_going & (better.pair == new_pair), False)
+            same = np.where(better.value <= reward, new_going & (better.policy == new_pair), False)
             change = (least < lowered * (1 - 1e-13)) & ~same
             if not change.any():
                 break
             lowered = np.where(change, least, lowered)
-            new_pair = np.where(change, better.pair, new_pair)
+            new_pair = np.where(change, better.policy, new_pair)
             new_going = np.where(change, better.value <= reward, new_going)
         if lowered is w:
-            return Stopping(np.minimum(w, reward), pair, going, True)
+            return Stopping(np.minimum(w, reward), policy, going, True)
         new = _stopped(lp, gamma, reward, new_pair, new_going, w, stop)
         if new is None or not (new < w).any():
             break  # rounding made a change look better than it is
-        w, pair, going = new, new_pair, new_going
-    return Stopping(np.minimum(w, reward), pair, going, False)
+        w, policy, going = new, new_pair, new_going
+    return Stopping(np.minimum(w, reward), policy, going, False)
 
 
 def _stopped(
     lp: StabilizationLP,
     gamma: float,
     reward: Floats,
-    pair: Pairs,
+    policy: Pairs,
     going: Bools,
     before: Floats,
     stop: Stop,
@@ -135,7 +135,7 @@ def _stopped(
     w = reward.copy()
     if going.any():
         unit = np.maximum(before, LEAST_UNIT)
-        P = gamma * lp.rows.matrix(pair[going])
+        P = gamma * lp.rows.matrix(policy[going])
         P.data *= unit[P.indices] / np.repeat(unit[going], np.diff(P.indptr))
         new = equations.solve(P[:, going], P[:, ~going] @ (reward / unit)[~going], stop=stop)
         if new is None:

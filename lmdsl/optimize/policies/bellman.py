@@ -27,12 +27,12 @@ class Improvement:
     ----------
     value
         (T V)_i, shape (n,).
-    pair
+    policy
         The first minimising column of every cell, shape (n,).
     """
 
     value: Floats
-    pair: Pairs
+    policy: Pairs
 
 
 def improve(
@@ -50,7 +50,7 @@ def improve(
     gamma, cost
         Other than the LP's own; ``cost`` has shape (K,).
     """
-    value, pair = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
+    value, policy = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
     x = padded(V)
     gamma = lp.gamma if gamma is None else gamma
     cost = lp.cost if cost is None else cost
@@ -58,11 +58,11 @@ def improve(
     def part(cells: tuple[int, int]) -> None:
         _improve(
             *cells, *lp.kernel,
-            cost, gamma, x, value, pair,
+            cost, gamma, x, value, policy,
         )  # fmt: skip
 
     over_cells(lp, part)
-    return Improvement(value, pair)
+    return Improvement(value, policy)
 
 
 def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Improvement:
@@ -77,17 +77,17 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
     backwards
         The order in which the cells of a range are visited.
     """
-    value, pair = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
+    value, policy = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
     x = padded(V)
 
     def part(cells: tuple[int, int]) -> None:
         _rise(
             *cells, *lp.kernel,
-            gamma, x.copy(), backwards, value, pair,  # the others keep the values from before
+            gamma, x.copy(), backwards, value, policy,  # the others keep the values from before
         )  # fmt: skip
 
     over_cells(lp, part, IN_PLACE)
-    return Improvement(value, pair)
+    return Improvement(value, policy)
 
 
 def below(lp: StabilizationLP, V: Floats, limit: Floats) -> NDArray[np.bool_]:
@@ -111,7 +111,7 @@ def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDAr
 
 @kernel
 def _improve(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, value, pair
+    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, value, policy
 ):
     for i in range(np.uint64(first), np.uint64(last)):
         best, choice = np.inf, pair_pointer[i]
@@ -122,7 +122,7 @@ def _improve(  # type: ignore[no-untyped-def]
             q = gamma * q + cost[k]
             if q < best:
                 best, choice = q, k
-        value[i], pair[i] = best, choice
+        value[i], policy[i] = best, choice
 
 
 @kernel
@@ -139,7 +139,7 @@ def _below(  # type: ignore[no-untyped-def]
 
 @kernel
 def _rise(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, x, backwards, value, pair
+    first, last, pair_pointer, pointer, target, code, share, gamma, x, backwards, value, policy
 ):
     first, last = np.uint64(first), np.uint64(last)
     for t in range(last - first):
@@ -154,6 +154,6 @@ def _rise(  # type: ignore[no-untyped-def]
             if left > 0.0 and q < best * left:
                 best, choice = q / left, k
         x[i] = best if best > x[i] else x[i]
-        pair[i] = choice
+        policy[i] = choice
     for i in range(first, last):
         value[i] = x[i]

@@ -16,7 +16,7 @@ from lmdsl.optimize.linear.substitution import Peeled
 
 def evaluate(
     lp: StabilizationLP,
-    pair: Pairs,
+    policy: Pairs,
     gamma: float | None = None,
     cost: Floats | None = None,
     start: Floats | None = None,
@@ -28,7 +28,7 @@ def evaluate(
 
     Parameters
     ----------
-    lp, pair
+    lp, policy
         The model, and one column per cell.
     gamma, cost
         Other than the LP's own; ``cost`` has shape (K,).
@@ -42,23 +42,23 @@ def evaluate(
         gamma P_u, where it is at hand.
     """
     gamma = lp.gamma if gamma is None else gamma
-    b = (lp.cost if cost is None else cost)[pair]
-    if gamma >= 1 and not transient and not reaches_attractor(lp, pair).all():
+    b = (lp.cost if cost is None else cost)[policy]
+    if gamma >= 1 and not transient and not reaches_attractor(lp, policy).all():
         return None
     x = np.array(b if start is None else start, dtype=np.float64)
-    rows = peeled(lp, pair, gamma) if rows is None else rows
-    found = equations.solve_from(rows, b, x, lambda: gamma * lp.rows.matrix(pair), stop=stop)
+    rows = peeled(lp, policy, gamma) if rows is None else rows
+    found = equations.solve_from(rows, b, x, lambda: gamma * lp.rows.matrix(policy), stop=stop)
     return x if found else None
 
 
-def peeled(lp: StabilizationLP, pair: Pairs, gamma: float) -> Peeled:
+def peeled(lp: StabilizationLP, policy: Pairs, gamma: float) -> Peeled:
     """Return gamma P_u, ready for :func:`evaluate`."""
-    return Peeled.of(of_policy(lp, pair, gamma))
+    return Peeled.of(of_policy(lp, policy, gamma))
 
 
 def stability_vector(
     lp: StabilizationLP,
-    pair: Pairs,
+    policy: Pairs,
     guess: Floats | None = None,
     g: float | None = None,
     sharp: bool = False,
@@ -71,19 +71,19 @@ def stability_vector(
     1 is lost in rounding, the value at a slightly larger weight leaves a relative slack instead.
     """
     g = lp.growth if g is None else g
-    if guess is not None and (d := bounds.decrease(lp, pair, guess, g)) is not None:
+    if guess is not None and (d := bounds.decrease(lp, policy, guess, g)) is not None:
         return guess, d
     unit = np.ones(lp.n)
     w = unit.copy()
-    rows = peeled(lp, pair, g) if rows is None else rows
+    rows = peeled(lp, policy, g) if rows is None else rows
     # Sweeps from below leave 1 + g P w - w at most what they still move.
     if equations.advance(rows, unit, w, 128, 0.0, 1e-2 if sharp else 0.25) < np.inf:
-        d = bounds.decrease(lp, pair, w, g)
+        d = bounds.decrease(lp, policy, w, g)
         if d is not None:
             return w, d
     units = np.broadcast_to(1.0, lp.K)  # takes no memory
     for inflation in (0.0, 5e-7, 1e-10):
-        w_more = evaluate(lp, pair, g * (1 + inflation), units, guess, stop=stop)
-        if w_more is not None and (d := bounds.decrease(lp, pair, w_more, g)) is not None:
+        w_more = evaluate(lp, policy, g * (1 + inflation), units, guess, stop=stop)
+        if w_more is not None and (d := bounds.decrease(lp, policy, w_more, g)) is not None:
             return w_more, d
     return None, None

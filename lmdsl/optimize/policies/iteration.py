@@ -1,6 +1,6 @@
 """Policies of the finite model: evaluate, improve, break ties.
 
-A policy is an array of columns, one per cell of C (``pair``). P_u, G_u are its rows. It is
+A policy is an array of columns, one per cell of C (``policy``). P_u, G_u are its rows. It is
 *gamma-stabilizing* when the spectral radius of gamma P_u is below 1; then its value
 V = G_u + gamma P_u V is finite. Write g = max(gamma, 1).
 
@@ -49,7 +49,7 @@ class Iteration:
 
     Attributes
     ----------
-    pair, value
+    policy, value
         The last policy and its value.
     steps
         Improvement steps that changed the policy.
@@ -59,7 +59,7 @@ class Iteration:
         Lower bounds of the rivals of each cell's control at the value.
     """
 
-    pair: Pairs
+    policy: Pairs
     value: Floats
     steps: int
     converged: bool
@@ -68,7 +68,7 @@ class Iteration:
 
 def iterate(
     lp: StabilizationLP,
-    pair: Pairs,
+    policy: Pairs,
     value: Floats,
     gamma: float | None = None,
     cost: Floats | None = None,
@@ -79,7 +79,7 @@ def iterate(
 
     Parameters
     ----------
-    lp, pair
+    lp, policy
         The model and the first policy.
     value
         Its value, or any V >= T_u V, such as :func:`bound` gives.
@@ -107,7 +107,7 @@ def iterate(
     stalls = True  # sweeps do, in a single mode, as far as was seen
     while True:
         out = stop() or step == limit
-        done = screen.improve(V, pair, TIE) if not out else Pass(V, pair, 0, 0)
+        done = screen.improve(V, policy, TIE) if not out else Pass(V, policy, 0, 0)
         exact = None
         if done.changed:
             step += 1
@@ -137,28 +137,28 @@ def iterate(
                 exact = x if left <= TOLERANCE and paid else None
                 x = np.minimum(x, done.value)
             screen.follow(V, x)
-            pair, V = done.pair, x
-        elif last is not None and last[0] is pair:
+            policy, V = done.policy, x
+        elif last is not None and last[0] is policy:
             return Iteration(*last, step, not out, screen)
         else:
             try:
-                rows = rows or Peeled.of(screen.slots.system(pair))
-                exact = evaluate(lp, pair, gamma, cost, done.value, True, stop, rows)
+                rows = rows or Peeled.of(screen.slots.system(policy))
+                exact = evaluate(lp, policy, gamma, cost, done.value, True, stop, rows)
                 if exact is None:
-                    exact = evaluate(lp, pair, gamma, cost, stop=stop)
+                    exact = evaluate(lp, policy, gamma, cost, stop=stop)
             except Stopped:
-                return Iteration(*(last or (pair, V)), step, False, screen)
+                return Iteration(*(last or (policy, V)), step, False, screen)
             if exact is None:
-                return Iteration(*(last or (pair, V)), step, last is not None and not out, screen)
+                return Iteration(*(last or (policy, V)), step, last is not None and not out, screen)
             screen.follow(V, np.minimum(exact, V))
             V = exact
         if exact is not None:
             if last is not None and not (exact < last[1]).any():
                 # Rounding made a change look better than it is.
                 return Iteration(*last, step, not out, screen)
-            last = pair, exact
+            last = policy, exact
         if out:
-            return Iteration(*(last or (pair, V)), step, False, screen)
+            return Iteration(*(last or (policy, V)), step, False, screen)
 
 
 def _fall(before: Floats, after: Floats) -> float:
@@ -167,37 +167,37 @@ def _fall(before: Floats, after: Floats) -> float:
     return 1.0 - float(ratio.min(initial=1.0))
 
 
-def bound(lp: StabilizationLP, pair: Pairs, w: Floats | None = None) -> Floats | None:
+def bound(lp: StabilizationLP, policy: Pairs, w: Floats | None = None) -> Floats | None:
     """Return V >= T_u V of a g-stabilizing policy, close to its value; None where none is found.
 
     With w >= g P_u w + d, c w serves as soon as c d >= G_u; sweeps then lower it. Where all rows
     lose about as much of what is paid, a constant is close already.
     """
-    cost = lp.cost[pair]
-    even = _even(lp, pair, lp.gamma, cost)
+    cost = lp.cost[policy]
+    even = _even(lp, policy, lp.gamma, cost)
     if even is not None:
         return even
-    w, d = stability_vector(lp, pair, w)
+    w, d = stability_vector(lp, policy, w)
     if w is None or d is None:
         return None
     V = _covering(w, d, cost)
     if V is None or _close(V[0] / w[0], d, cost):
         return V
     x = V.copy()
-    equations.advance(peeled(lp, pair, lp.gamma), cost, x, MOST_SWEEPS, 1e-2, 0.0)
+    equations.advance(peeled(lp, policy, lp.gamma), cost, x, MOST_SWEEPS, 1e-2, 0.0)
     return np.minimum(x, V)
 
 
-def _even(lp: StabilizationLP, pair: Pairs, gamma: float, cost: Floats) -> Floats | None:
+def _even(lp: StabilizationLP, policy: Pairs, gamma: float, cost: Floats) -> Floats | None:
     """Return a constant V >= T_u V within a percent of the policy's value, None where none is."""
     some = np.arange(0, lp.n, lp.n // PROBES + 1)  # few have to be looked at where none is
-    rows = lp.rows.take(pair[some])
+    rows = lp.rows.take(policy[some])
     stays = np.where(rows.target < lp.n, rows.shares.value[rows.code], 0.0)
     d = 1 - gamma * np.add.reduceat(stays, rows.pointer[:-1])
     if not ((d > 0).all() and _close(float((cost[some] / d).max()), d, cost[some])):
         return None
     ones = np.ones(lp.n)
-    lost = bounds.decrease(lp, pair, ones, gamma)
+    lost = bounds.decrease(lp, policy, ones, gamma)
     V = None if lost is None else _covering(ones, lost, cost)
     return V if V is not None and lost is not None and _close(V[0], lost, cost) else None
 

@@ -20,7 +20,7 @@ MARGIN = 1e-9
 
 
 def survivors(
-    lp: StabilizationLP, pair: Pairs, w: Floats | None = None, stop: Stop = never
+    lp: StabilizationLP, policy: Pairs, w: Floats | None = None, stop: Stop = never
 ) -> Pairs:
     """Return the columns that may belong to an optimal policy, and those of a first one, ascending.
 
@@ -28,15 +28,15 @@ def survivors(
     ----------
     lp
         The linear program.
-    pair, w
+    policy, w
         A gamma-stabilizing policy, a column per cell, and a proof of it where known.
     stop
         Asked between passes; ends the work with what is known.
     """
-    start = iteration.bound(lp, pair, w)
+    start = iteration.bound(lp, policy, w)
     if start is None:
         return np.arange(lp.K)
-    done = iteration.iterate(lp, pair, start, stop=stop, limit=STEPS)
+    done = iteration.iterate(lp, policy, start, stop=stop, limit=STEPS)
     lower = np.zeros(lp.n)
     for _ in range(PASSES):
         higher = np.maximum(lower, bellman.improve(lp, lower).value)
@@ -45,5 +45,5 @@ def survivors(
         if stop() or risen <= LEAST_RISE * float(lower.sum()):
             break
     kept = bellman.below(lp, lower, done.value * (1 + MARGIN))
-    kept[done.pair] = kept[pair] = True  # the first policy leads to A from everywhere
+    kept[done.policy] = kept[policy] = True  # the first policy leads to A from everywhere
     return np.flatnonzero(kept)

@@ -37,7 +37,7 @@ class Pass:
     ----------
     value
         min(V, T V) where a control changed, min(V, T_u V) elsewhere, shape (n,).
-    pair
+    policy
         The policy after the pass, shape (n,).
     changed
         Number of cells whose control changed.
@@ -46,7 +46,7 @@ class Pass:
     """
 
     value: Floats
-    pair: Pairs
+    policy: Pairs
     changed: int
     looked: int
 
@@ -78,7 +78,7 @@ class Screen:
         self.paid = np.full(lp.n, np.nan)
         self.scale = 1.0
         self.passes = 0
-        self.pair: Pairs | None = None  # whose rivals
+        self.policy: Pairs | None = None  # whose rivals
 
     @cached_property
     def slots(self) -> Slots:
@@ -86,7 +86,7 @@ class Screen:
         lp = self.lp
         return Slots.of(lp.rows, lp.pair_pointer, self.gamma, lp.directions)
 
-    def improve(self, V: Floats, pair: Pairs, margin: float) -> Pass:
+    def improve(self, V: Floats, policy: Pairs, margin: float) -> Pass:
         """Change a control where another one is better by more than a relative margin.
 
         Cells are visited forwards and backwards by turns, each with the new values of those before
@@ -94,7 +94,7 @@ class Screen:
 
         Parameters
         ----------
-        V, pair
+        V, policy
             Values, shape (n,), and the policy, a column per cell: V >= T_u V. So a policy other
             than that of the last pass is looked at wherever it differs, as one of its rivals.
         margin
@@ -104,7 +104,7 @@ class Screen:
         value, new = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
         x, backwards = vectors.padded(V), self.passes % 2 == 1
         self.passes += 1
-        own, slots = pair.view(np.uint64), self.slots.kernel
+        own, slots = policy.view(np.uint64), self.slots.kernel
 
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(
@@ -114,11 +114,11 @@ class Screen:
             return int(changed), int(looked)
 
         counts = vectors.over_cells(lp, part, bellman.IN_PLACE)
-        self.pair = new
+        self.policy = new
         return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
 
     def tied(
-        self, V: Floats, tolerance: float, pair: Pairs
+        self, V: Floats, tolerance: float, policy: Pairs
     ) -> tuple[NDArray[np.bool_], Pairs, bool]:
         """Find the columns with Q <= Q_min + tolerance |Q_min| at V, and those of a policy.
 
@@ -126,7 +126,7 @@ class Screen:
         ----------
         V, tolerance
             An optimal value, shape (n,), to a relative 1e-9, and what counts as equal, below 1e-7.
-        pair
+        policy
             A policy with this value, a column per cell.
 
         Returns
@@ -137,8 +137,8 @@ class Screen:
         """
         lp = self.lp
         x, ties = vectors.padded(V), np.empty(lp.K, dtype=np.bool_)
-        first, own = np.empty(lp.n, dtype=np.int64), pair.view(np.uint64)
-        known = self.pair is not None and np.array_equal(self.pair, pair)
+        first, own = np.empty(lp.n, dtype=np.int64), policy.view(np.uint64)
+        known = self.policy is not None and np.array_equal(self.policy, policy)
         rival = self.rival if known else np.zeros(lp.n)
         most = int(np.diff(lp.pair_pointer).max(initial=0))
 
@@ -168,7 +168,7 @@ def _least_ratio(before: Floats, after: Floats) -> float:
 
 @kernel
 def _pass(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, cost, x, pair, margin, scale, backwards, rival, value, new, paid,
+    first, last, pair_pointer, cost, x, policy, margin, scale, backwards, rival, value, new, paid,
     held, pointer, target, code, share, columns, gamma, begins, ends, indices, data, inverse,
 ):  # fmt: skip
     """Improve the cells of a range in turn; ``rival`` gets the bounds of those that were read.
@@ -182,7 +182,7 @@ def _pass(  # type: ignore[no-untyped-def]
     store, shrink = (1.0 - 1e-12) / scale, 1.0 / scale
     for t in range(last - first):
         i = last - ONE - t if backwards else first + t
-        own, begin, end = pair[i], pair_pointer[i], pair_pointer[i + ONE]
+        own, begin, end = policy[i], pair_pointer[i], pair_pointer[i + ONE]
         new[i] = own
         if rival[i] < x[i] * shrink:
             best, second, choice = np.inf, np.inf, own
@@ -225,7 +225,7 @@ def _pass(  # type: ignore[no-untyped-def]
 @kernel
 def _ties(  # type: ignore[no-untyped-def]
     first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, tolerance, scale,
-    rival, pair, ties, chosen, q,
+    rival, policy, ties, chosen, q,
 ):  # fmt: skip
     """Mark the tied columns of a range of cells: first Q_min, then all that come near.
 
@@ -237,8 +237,8 @@ def _ties(  # type: ignore[no-untyped-def]
         begin, end = pair_pointer[i], pair_pointer[i + ONE]
         if rival[i] * scale > V[i] * (1.0 + tolerance + 1e-9):
             for k in range(begin, end):
-                ties[k] = k == pair[i]
-            chosen[i] = pair[i]
+                ties[k] = k == policy[i]
+            chosen[i] = policy[i]
             continue
         best = np.inf
         for k in range(begin, end):
@@ -249,7 +249,7 @@ def _ties(  # type: ignore[no-untyped-def]
             best = q[k - begin] if q[k - begin] < best else best
         count, chosen[i] = 0, -1
         for k in range(begin, end):
-            ties[k] = (q[k - begin] <= best + tolerance * abs(best)) | (k == pair[i])
+            ties[k] = (q[k - begin] <= best + tolerance * abs(best)) | (k == policy[i])
             if ties[k]:
                 count += 1
                 if chosen[i] < 0:

@@ -20,7 +20,7 @@ from lmdsl.optimize.policies.screening import Screen
 
 def canonical(
     lp: StabilizationLP,
-    pair: Pairs,
+    policy: Pairs,
     value: Floats,
     screen: Screen | None = None,
     stop: Stop = never,
@@ -33,7 +33,7 @@ def canonical(
 
     Parameters
     ----------
-    lp, pair, value
+    lp, policy, value
         The model, an optimal policy and its value.
     screen
         Lower bounds of the rivals of each cell's control at this value, where they are known.
@@ -42,13 +42,13 @@ def canonical(
     """
     if screen is None:
         screen = Screen(lp)
-    ties, first, several = screen.tied(value, TIE, pair)
+    ties, first, several = screen.tied(value, TIE, policy)
     if not several:
         return first
     if not memory.fits(_taken_by_ties(lp, int(ties.sum()))):
-        return pair
+        return policy
     if ties.all():  # the whole model, of which no copy is made
-        sub, start, columns, inside = lp, pair, None, np.arange(lp.n)
+        sub, start, columns, inside = lp, policy, None, np.arange(lp.n)
     else:
         found = stabilizable_set.stabilizable(*_columns(lp, ties))
         if not found.inside.any():
@@ -56,9 +56,9 @@ def canonical(
         columns = np.flatnonzero(ties)[found.surviving]
         inside = np.flatnonzero(found.inside)
         sub = lp.part(columns, inside)
-        start = np.searchsorted(columns, pair[inside])
+        start = np.searchsorted(columns, policy[inside])
         start = np.minimum(start, len(columns) - 1)
-        owned = columns[start] == pair[inside]
+        owned = columns[start] == policy[inside]
         if not owned.all():
             start = np.where(owned, start, sub._algorithm_1[1])
     del ties
@@ -70,7 +70,7 @@ def canonical(
         start = sub._algorithm_1[1]
         w = evaluate(sub, start, lp.growth, unit, stop=stop)
     if w is None:
-        return pair
+        return policy
     done = iterate(sub, start, w, lp.growth, unit, stop=stop)
     if stop():
         raise Stopped
