@@ -5,7 +5,7 @@ import signal
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parent / "helpers"))
 
 # Many tests start processes, which need not parse all of lmdsl each time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

@@ -7,6 +7,7 @@ import pytest
 import scipy.sparse as sp
 from models import random_lp
 from problems import made
+from slow_models import above, exact, mixing, transport
 
 import lmdsl as lm
 from lmdsl.common import types
@@ -16,32 +17,6 @@ from lmdsl.optimize.linear.policy_system import of_policy
 from lmdsl.optimize.linear.substitution import Peeled
 from lmdsl.optimize.policies import evaluation, iteration
 from lmdsl.optimize.policies.screening import Screen
-
-
-def mixing(n, escape, rng, spread=4):
-    """Return a sparse matrix whose rows sum to 1 - escape, with targets anywhere."""
-    target = rng.integers(0, n, (n, spread))
-    weight = rng.random((n, spread))
-    weight *= (1 - escape) / weight.sum(axis=1, keepdims=True)
-    M = sp.csr_array((weight.ravel(), (np.repeat(np.arange(n), spread), target.ravel())), (n, n))
-    M.sum_duplicates()
-    return M
-
-
-def transport(n, rng):
-    """Return a walk to the left with a little spread: no single slow mode."""
-    back, stay = rng.uniform(0.0, 0.1, n), rng.uniform(0.3, 0.5, n)
-    M = sp.dia_array((np.array([1 - back - stay, stay, back]), [-1, 0, 1]), shape=(n, n))
-    return sp.csr_array(M)
-
-
-def exact(M, b):
-    return sp.linalg.spsolve(sp.eye_array(M.shape[0], format="csc") - M.tocsc(), b)
-
-
-def above(M, b, rng):
-    """Return an x >= b + M x, neither near the solution nor parallel to it."""
-    return exact(M, b * rng.uniform(1.0, 3.0, len(b)))
 
 
 @pytest.mark.parametrize("gamma", [0.5, 0.9999, 1.0, 1.01])

@@ -1,6 +1,6 @@
 """The house in numbers: rooms a level, imports between packages, lengths, files a word touches.
 
-``python tests/house.py [FOLDER]`` prints them; ``test_design.py`` uses the same functions.
+``python tests/helpers/house.py [FOLDER]`` prints them; ``test_design.py`` uses the same functions.
 Imports under TYPE_CHECKING do not count; those inside functions do, and are told apart.
 """
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 from problems import made, standard_map
-from test_evaluation import above, exact, mixing, transport
+from slow_models import above, exact, mixing, transport
 
 import lmdsl as lm
 from lmdsl.common import types

@@ -22,7 +22,7 @@ from lmdsl.certificate.exact_checks import check_exactly
 from lmdsl.cli import main
 from lmdsl.results.exports import export_certificate, export_drn
 
-SCRIPT = Path(__file__).parents[1] / "tools/check_certificate.py"
+SCRIPT = Path(__file__).parents[2] / "tools/check_certificate.py"
 NOISE = {"w": {"values": [0.1, -0.2, 0.02], "weights": [0.1, 0.2, 0.7]}}
 
 

@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 import pytest
+from corners import corner
 from problems import doubling, made, standard_map, steps
-from test_gamma import corner
 
 import lmdsl as lm
 from lmdsl.cli import main

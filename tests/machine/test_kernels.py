@@ -17,7 +17,7 @@ import pytest
 from lmdsl.cli.output import Narrator
 from lmdsl.machine import kernels
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 import lmdsl as lm
 
 NAMED = lm.systems.NAMED
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = Path(__file__).parents[2] / "examples"
 ATTRACTOR = 0
 
 # Attractor cells, stabilizable cells, and the least share of the other cells that is stabilizable.

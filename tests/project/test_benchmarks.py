@@ -11,7 +11,7 @@ import pytest
 
 import lmdsl as lm
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import measure, models, pipeline, report, rivals, targets  # noqa: E402
@@ -121,7 +121,7 @@ def contest(tmp_path_factory):
     """The contest of all fake rivals, and the processes that are left after it."""
     folder = tmp_path_factory.mktemp("contest")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(ROOT / "tests"))
+        patch.setenv("PYTHONPATH", str(ROOT / "tests/helpers"))
         facts = measure.prepared("standard-map-10", 1.02, folder, 100)
         fakes = [Contestant(name, "fake_rival", name) for name in FATES]
         gone = Contestant("is not there", "fake_rival", package="no_such_package_anywhere")

@@ -23,7 +23,7 @@ from lmdsl.model.assembly.transitions import estimate
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import Regions
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1] / "helpers"
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 
 

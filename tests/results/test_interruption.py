@@ -25,7 +25,7 @@ from lmdsl.optimize.linear import classes
 from lmdsl.optimize.policies import evaluation
 from lmdsl.results.directory import writing
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1] / "helpers"
 posix = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and signals")
 
 

@@ -10,11 +10,11 @@ import warnings
 import numpy as np
 import pydantic
 import pytest
+from bad_files import BAD, NOISE
 from jsonschema import Draft202012Validator
 from problems import doubling, standard_map, steps
 from random_problems import CORNER_CASES, random_problem
-from test_fuzz import spoiled_file
-from test_problem import BAD, NOISE
+from spoiled_files import spoiled_file
 
 import lmdsl as lm
 from lmdsl.common.files import strict_json

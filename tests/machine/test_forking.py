@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import pytest
 
@@ -98,7 +99,7 @@ def test_a_child_of_multiprocessing_that_imports_late_is_noticed(tmp_path, metho
     """)
     )
     command = [sys.executable, "-W", "ignore::DeprecationWarning", str(script)]
-    root = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+    root = str(Path(__file__).parents[2])
     environment = {**os.environ, "PYTHONPATH": root}
     done = subprocess.run(
         command, env=environment, capture_output=True, text=True, check=False, timeout=600

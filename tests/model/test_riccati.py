@@ -6,8 +6,8 @@ from decimal import Decimal, localcontext
 
 import numpy as np
 import pytest
+from local_controllers import ORBIT, linear_system, local_of
 from problems import made, standard_map
-from test_local import ORBIT, linear_system, local_of
 
 import lmdsl as lm
 from lmdsl.model import riccati
