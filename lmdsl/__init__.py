@@ -12,7 +12,6 @@ from lmdsl.machine import forking as forking
 
 if TYPE_CHECKING:
     from lmdsl import backends as backends
-    from lmdsl import exports as exports
     from lmdsl import plotting as plotting
     from lmdsl import systems as systems
     from lmdsl import testing as testing
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from lmdsl.optimize.feasibility.gamma_bar import gamma_max as gamma_max
     from lmdsl.problem.problem import Problem as Problem
     from lmdsl.problem.problem import load as load
+    from lmdsl.results import exports as exports
     from lmdsl.results.comparison import Comparison as Comparison
     from lmdsl.results.comparison import compare as compare
     from lmdsl.results.result import Result as Result

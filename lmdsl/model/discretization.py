@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Floats
 from lmdsl.machine import memory
-from lmdsl.problem.problem import ControlRange, ControlValues, Grid, NoiseNormal, Problem, Random
+from lmdsl.problem.problem import Problem
 
 NODE = 400
 """Bytes for each noise node: its values, its weight, and what orders them."""
@@ -21,40 +20,20 @@ NODE = 400
 def offsets(problem: Problem) -> Floats:
     """Return the sample offsets within a cell, shape (points, d), in [0, 1)."""
     d = len(problem.state_box)
-    sampling = problem.sampling
     memory.require(32 * d * sample_points(problem), "sample points")
-    if isinstance(sampling, Grid):
-        k = sampling.per_axis
-        axis = (np.arange(k) + 0.5) / k
-        return np.stack(np.meshgrid(*[axis] * d, indexing="ij"), axis=-1).reshape(-1, d)
-    if isinstance(sampling, Random):
-        return np.random.default_rng(sampling.seed).random((sampling.points, d))
-    from scipy.stats import qmc
-
-    with warnings.catch_warnings():
-        # Balance wants a power of two; any number of points is a valid sample.
-        warnings.simplefilter("ignore", UserWarning)
-        points: Floats = qmc.Sobol(d, scramble=True, seed=sampling.seed).random(sampling.points)
-    return points
+    return problem.sampling.offsets(d)
 
 
 def sample_points(problem: Problem) -> int:
     """Return the number of sample points per cell without making them."""
-    sampling = problem.sampling
-    if isinstance(sampling, Grid):
-        return int(sampling.per_axis ** len(problem.state_box))
-    return int(sampling.points)
+    return problem.sampling.count(len(problem.state_box))
 
 
 def control_values(problem: Problem) -> list[Floats]:
     """Return the values of every control."""
-    memory.require(16 * max(map(_count, problem.control_grid.values()), default=0), "controls")
-    return [
-        np.array(axis.values)
-        if isinstance(axis, ControlValues)
-        else np.linspace(axis.low, axis.high, axis.points)
-        for axis in problem.control_grid.values()
-    ]
+    axes = problem.control_grid.values()
+    memory.require(16 * max((axis.count() for axis in axes), default=0), "controls")
+    return [axis.vector() for axis in axes]
 
 
 def control_vectors(problem: Problem) -> Floats:
@@ -68,23 +47,14 @@ def control_vectors(problem: Problem) -> Floats:
 
 def control_count(problem: Problem) -> int:
     """Return M without making the control vectors."""
-    return math.prod(map(_count, problem.control_grid.values()))
+    return math.prod(axis.count() for axis in problem.control_grid.values())
 
 
 def control_range(problem: Problem) -> tuple[Floats, Floats]:
     """Return the least and the largest value of every control without making the others."""
-    ends = [
-        (min(axis.values), max(axis.values))
-        if isinstance(axis, ControlValues)
-        else (axis.low, axis.high)
-        for axis in problem.control_grid.values()
-    ]
+    ends = [axis.ends() for axis in problem.control_grid.values()]
     low, high = np.array(ends, dtype=float).reshape(-1, 2).T
     return low, high
-
-
-def _count(axis: ControlRange | ControlValues) -> int:
-    return len(axis.values) if isinstance(axis, ControlValues) else axis.points
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +92,7 @@ def noise_nodes(problem: Problem) -> Nodes:
         return Nodes(np.zeros((1, 0)), np.ones(1), np.zeros(1, dtype=np.int64))
     variables = []
     for noise in problem.noise.values():
-        if isinstance(noise, NoiseNormal):
-            x, w = np.polynomial.hermite.hermgauss(noise.normal.points)
-            values, weights = math.sqrt(2) * noise.normal.std * x, w
-        else:
-            values, weights = np.array(noise.values), np.array(noise.weights)
+        values, weights = noise.nodes()
         kept = weights > 0
         weights = weights[kept] / math.fsum(weights[kept])
         variables.append((values[kept], weights))
@@ -145,7 +111,4 @@ def noise_nodes(problem: Problem) -> Nodes:
 
 def node_count(problem: Problem) -> int:
     """Return an upper bound of the number of noise nodes without making them."""
-    return math.prod(
-        noise.normal.points if isinstance(noise, NoiseNormal) else len(noise.values)
-        for noise in (problem.noise or {}).values()
-    )
+    return math.prod(noise.count() for noise in (problem.noise or {}).values())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
+import numpy as np
 from pydantic import BeforeValidator, Tag, model_validator
 
 from lmdsl.common.strict_model import (
@@ -16,6 +17,7 @@ from lmdsl.common.strict_model import (
     frozen_dict,
     plain,
 )
+from lmdsl.common.types import Floats
 from lmdsl.errors import BadInput
 from lmdsl.formulas.names import named_keys, valid_names
 from lmdsl.problem.unions import tag_by_key
@@ -38,6 +40,18 @@ class ControlRange(Declared):
             raise BadInput(f"high - low overflows: {self.low!r}, {self.high!r}")
         return self
 
+    def count(self) -> int:
+        """Return the number of values without making them."""
+        return self.points
+
+    def ends(self) -> tuple[float, float]:
+        """Return the least and the largest value without making the others."""
+        return self.low, self.high
+
+    def vector(self) -> Floats:
+        """Return the values, in the order of the control index."""
+        return np.linspace(self.low, self.high, self.points)
+
 
 class ControlValues(Declared):
     """Control values written out; distinct, order kept."""
@@ -52,6 +66,18 @@ class ControlValues(Declared):
                 raise BadInput(f"{value!r} stands twice; list each value once", "values")
             seen.add(value)
         return self
+
+    def count(self) -> int:
+        """See :meth:`ControlRange.count`."""
+        return len(self.values)
+
+    def ends(self) -> tuple[float, float]:
+        """See :meth:`ControlRange.ends`."""
+        return min(self.values), max(self.values)
+
+    def vector(self) -> Floats:
+        """See :meth:`ControlRange.vector`."""
+        return np.array(self.values)
 
 
 ControlUnion = Annotated[

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from typing import Annotated
 
+import numpy as np
 from pydantic import BeforeValidator, Field, Tag, model_validator
 
 from lmdsl.common.strict_model import Declared, Numbers, Positive, frozen_dict, plain
+from lmdsl.common.types import Floats
 from lmdsl.errors import BadInput
 from lmdsl.formulas.names import named_keys, valid_names
 from lmdsl.problem.unions import EachWords, tag_by_key
@@ -43,6 +45,14 @@ class NoiseValues(Declared):
             raise BadInput(f"the weights sum to {total!r}; they must sum to 1", "weights")
         return self
 
+    def count(self) -> int:
+        """Return the number of nodes without making them."""
+        return len(self.values)
+
+    def nodes(self) -> tuple[Floats, Floats]:
+        """Return the nodes and their weights, which are not scaled and may be zero."""
+        return np.array(self.values), np.array(self.weights)
+
 
 class Normal(Declared):
     """A normal distribution of mean 0 by Gauss-Hermite quadrature."""
@@ -55,6 +65,15 @@ class NoiseNormal(Declared):
     """A normally distributed noise variable."""
 
     normal: Normal
+
+    def count(self) -> int:
+        """See :meth:`NoiseValues.count`."""
+        return self.normal.points
+
+    def nodes(self) -> tuple[Floats, Floats]:
+        """See :meth:`NoiseValues.nodes`."""
+        x, w = np.polynomial.hermite.hermgauss(self.normal.points)
+        return math.sqrt(2) * self.normal.std * x, w
 
 
 NoiseUnion = Annotated[
