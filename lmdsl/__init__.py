@@ -20,8 +20,12 @@ if TYPE_CHECKING:
     from lmdsl.control.simulation import Simulation as Simulation
     from lmdsl.errors import BadInput as BadInput
     from lmdsl.errors import LmdslError as LmdslError
+    from lmdsl.explanation.causes import Explanation as Explanation
     from lmdsl.explanation.causes import explain as explain
+    from lmdsl.explanation.lost_mass import PhaseOne as PhaseOne
     from lmdsl.machine.deadline import TimeLimitReached as TimeLimitReached
+    from lmdsl.model.grid.boxes import Area as Area
+    from lmdsl.model.grid.boxes import Region as Region
     from lmdsl.model.lp import StabilizationLP as StabilizationLP
     from lmdsl.model.lp import compile as compile
     from lmdsl.model.stabilizable_set import CellStatus as CellStatus
@@ -40,14 +44,18 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOME = {
+    "Area": "model.grid.boxes",
     "BadInput": "errors",
     "CellStatus": "model.stabilizable_set",
     "Certificate": "certificate.claims",
     "Comparison": "results.comparison",
     "Controller": "control.controller",
+    "Explanation": "explanation.causes",
     "GammaBar": "optimize.feasibility.gamma_bar",
     "LmdslError": "errors",
+    "PhaseOne": "explanation.lost_mass",
     "Problem": "problem.problem",
+    "Region": "model.grid.boxes",
     "Result": "results.result",
     "Simulation": "control.simulation",
     "StabilizationLP": "model.lp",

@@ -19,7 +19,9 @@ A solver's status plays no part. A claim that almost holds is repaired or refuse
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
+from lmdsl.common.json_values import jsonable
 from lmdsl.common.types import Floats, Pairs
 
 CLAIMS = ("stabilizing", "upper_bound", "lower_bound", "measure")
@@ -65,6 +67,14 @@ class Certificate:
         """Claims 1 to 4 hold and the gap is within the tolerance."""
         claims = all(getattr(self, name) for name in CLAIMS)
         return claims and self.gap is not None and self.gap <= self.tolerance
+
+    def __str__(self) -> str:
+        return f"verified, gap {self.gap:.2g}" if self.verified else "; ".join(self.reasons)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON; ``verified`` first, then the attributes."""
+        values: dict[str, Any] = jsonable({**vars(self), "reasons": list(self.reasons)})
+        return {"verified": self.verified, **values}
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,17 +52,13 @@ def _verify(parsed: Arguments) -> int:
     from lmdsl.results.verification import verify
 
     with Progress() as progress:
-        found = verify(parsed.dir, parsed.exact, progress, parsed.time_limit)
+        found = verify(
+            parsed.dir, exact=parsed.exact, progress=progress, time_limit=parsed.time_limit
+        )
     if parsed.json:
         print_json(found.to_dict())
     else:
-        say(f"{found.status}: " + ("every claim holds" if found.holds else "NOT confirmed"))
-        gap = found.certificate.gap
-        if gap is not None:
-            say(f"  gap {gap:.2g}, tolerance {found.certificate.tolerance:.2g}")
-        for sentence in (*found.reasons, *found.notes):
-            say(f"  {printable(sentence)}")
-        say("  (claims speak of the finite model: cells and sampled transitions)")
+        say(found.text())
     return 0 if found.holds else 1
 
 

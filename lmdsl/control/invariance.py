@@ -77,6 +77,8 @@ class LocalCheck:
             line += f"; orbit's multiplier {self.multiplier:.4g}"
         return line
 
+    __str__ = sentence
+
 
 def check(
     problem: Problem,

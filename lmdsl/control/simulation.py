@@ -20,7 +20,8 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.discretization import noise_nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.problem.problem import ConstantControl, Problem
+from lmdsl.problem.local_control import ConstantControl
+from lmdsl.problem.problem import Problem
 
 REACHED, LOST, CYCLING = 0, 1, 2
 
@@ -137,6 +138,8 @@ class Simulation(Frozen):
                     f"max {held.distance[1]:.3g} cell widths"
                 )
         return "\n".join(lines)
+
+    __str__ = text
 
 
 class ClosedLoop:

@@ -29,9 +29,8 @@ from numpy.typing import NDArray
 from lmdsl.common.frozen import Frozen
 from lmdsl.common.types import Floats
 from lmdsl.errors import LmdslError, shown
-from lmdsl.explanation import linprog
 from lmdsl.explanation.one_cell import NAMES
-from lmdsl.machine import apart, memory
+from lmdsl.machine import apart, linprog, memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.grid import boxes
@@ -175,3 +174,5 @@ class PhaseOne(Frozen):
                 f"{entry['residual']:.6g} rests there"
             )
         return "\n".join(lines)
+
+    __str__ = text

@@ -19,36 +19,15 @@ from lmdsl.common.strict_model import Declared, Positive
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.language import Formula, parse
 from lmdsl.formulas.names import FormulaText
-from lmdsl.problem.axes import Axis, StateBox
-from lmdsl.problem.controls import ControlGrid, ControlRange, ControlValues
+from lmdsl.problem.axes import StateBox
+from lmdsl.problem.controls import ControlGrid
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LocalUnion, LqrFeedback
-from lmdsl.problem.noise import Noise, NoiseNormal, NoiseValues
-from lmdsl.problem.sampling import Grid, Random, SamplingUnion, Sobol
+from lmdsl.problem.noise import Noise
+from lmdsl.problem.sampling import SamplingUnion
 from lmdsl.problem.schema import FileSchema
 from lmdsl.problem.sets import Attractor, Avoid, Measure
 from lmdsl.problem.system_kinds import SystemUnion
 from lmdsl.systems import FunctionSystem, System
-
-__all__ = [
-    "Attractor",
-    "Avoid",
-    "Axis",
-    "ConstantControl",
-    "ControlRange",
-    "ControlValues",
-    "Grid",
-    "LinearFeedback",
-    "LqrFeedback",
-    "Measure",
-    "NoiseNormal",
-    "NoiseValues",
-    "Problem",
-    "Random",
-    "Sobol",
-    "json_schema",
-    "load",
-    "parse_problem",
-]
 
 
 class Problem(Declared):

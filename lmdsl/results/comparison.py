@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,10 @@ class Agreement:
     controls: float
     value: float
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        return asdict(self)
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -65,7 +69,7 @@ class Comparison:
         a = self.agreement
         return {
             "results": [result.to_dict() for result in self.results],
-            "agreement": a and {"cost": a.cost, "controls": a.controls, "value": a.value},
+            "agreement": a and a.to_dict(),
         }
 
     @property

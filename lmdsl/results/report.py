@@ -57,6 +57,10 @@ class Coverage:
         percent = 100 * self.share if self.share == 1 else min(100 * self.share, 99.99)
         return f"{text} ({percent:.4g} %)"
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        return asdict(self)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Report(Frozen):
@@ -118,7 +122,7 @@ class Report(Frozen):
         covered, runs = self.coverage, self.simulation
         return {
             **self.stored(),
-            "coverage": covered and asdict(covered),
+            "coverage": covered and covered.to_dict(),
             "simulation": runs and jsonable(runs.to_dict()),
         }
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from lmdsl.certificate import sums
 from lmdsl.certificate.claims import Certificate
 from lmdsl.common import inputs
 from lmdsl.common.frozen import freeze
+from lmdsl.common.json_values import jsonable
 from lmdsl.common.types import Floats
 from lmdsl.control.controller import Controller
 from lmdsl.control.simulation import ClosedLoop, Simulation, simulate
@@ -53,6 +54,14 @@ class CostFrom:
     upper: float
     lower: float
     mass: float
+
+    def __str__(self) -> str:
+        return f"cost between {self.lower:.9g} and {self.upper:.9g} from {self.mass:.4g} of m"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return strict JSON data."""
+        found: dict[str, Any] = jsonable(asdict(self))
+        return found
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)

@@ -20,7 +20,7 @@ from lmdsl.certificate.exact_checks import check_exactly
 from lmdsl.common import inputs
 from lmdsl.common.json_values import jsonable
 from lmdsl.common.types import Progress
-from lmdsl.errors import BadInput
+from lmdsl.errors import BadInput, printable
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.surroundings import own_arithmetic
@@ -67,6 +67,19 @@ class Verification:
     reasons: tuple[str, ...]
     notes: tuple[str, ...]
 
+    def text(self) -> str:
+        """Return the outcome for people."""
+        lines = [f"{self.status}: " + ("every claim holds" if self.holds else "NOT confirmed")]
+        proof = self.certificate
+        if proof.gap is not None:
+            lines.append(f"  gap {proof.gap:.2g}, tolerance {proof.tolerance:.2g}")
+        lines += [f"  {printable(sentence)}" for sentence in (*self.reasons, *self.notes)]
+        return "\n".join(
+            [*lines, "  (claims speak of the finite model: cells and sampled transitions)"]
+        )
+
+    __str__ = text
+
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         proof = self.certificate
@@ -88,6 +101,7 @@ class Verification:
 @own_arithmetic
 def verify(
     path: str | os.PathLike[str],
+    *,
     exact: bool = False,
     progress: Progress | None = None,
     time_limit: float | Deadline | None = None,

@@ -31,7 +31,7 @@ from lmdsl.cli import main
 from lmdsl.errors import BadInput, MissingDependency
 from lmdsl.model import lp as model
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.problem.problem import Problem
+from lmdsl.problem import Problem
 from lmdsl.systems import StandardMap
 from lmdsl.testing import known
 

@@ -377,10 +377,10 @@ def test_verify_ends_and_says_nothing_about_the_claims(saved, capsys):
     assert main(["verify", saved, "--time-limit", "1000", "--exact"]) == 0
     for exact in (False, True):
         whole = Asked()
-        assert lm.verify(saved, exact, time_limit=whole).holds
+        assert lm.verify(saved, exact=exact, time_limit=whole).holds
         for part in (0.3, 0.8, 0.99):
             with pytest.raises(TimeLimitReached):
-                lm.verify(saved, exact, time_limit=Asked(int(part * whole.count)))
+                lm.verify(saved, exact=exact, time_limit=Asked(int(part * whole.count)))
 
 
 def test_verify_in_rational_arithmetic_asks_between_blocks(saved, monkeypatch):

@@ -91,7 +91,7 @@ def test_problems_are_frozen():
 
 
 def test_python_declaration_equals_the_file():
-    from lmdsl.problem.problem import Attractor, Axis, ControlRange, Problem, Random
+    from lmdsl.problem import Attractor, Axis, ControlRange, Problem, Random
     from lmdsl.systems import StandardMap
 
     problem = Problem(
@@ -112,7 +112,7 @@ def test_python_declaration_equals_the_file():
 
 
 def test_python_errors_are_bad_input_too():
-    from lmdsl.problem.problem import Axis
+    from lmdsl.problem import Axis
 
     with pytest.raises(lm.BadInput, match="less than"):
         Axis(low=1, high=0, cells=3)

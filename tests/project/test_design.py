@@ -28,9 +28,10 @@ ROOMS = [
 FORWARDING = {("model.lp", "results.exports.mps")}
 
 PUBLIC = [
-    "BadInput", "CellStatus", "Certificate", "Comparison", "Controller", "GammaBar",
-    "LmdslError", "Problem", "Result", "Simulation", "StabilizationLP", "TimeLimitReached",
-    "Verification", "__version__", "backends", "compare", "compile", "explain", "exports",
+    "Area", "BadInput", "CellStatus", "Certificate", "Comparison", "Controller", "Explanation",
+    "GammaBar", "LmdslError", "PhaseOne", "Problem", "Region", "Result", "Simulation",
+    "StabilizationLP", "TimeLimitReached", "Verification", "__version__", "backends",
+    "compare", "compile", "explain", "exports",
     "gamma_max", "load", "plotting", "solve", "systems", "testing", "verify",
 ]  # fmt: skip
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from lmdsl.common.types import Floats
+import numpy as np
+from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
 TIGHT = 1e-9
 
 
-def solved(price: Floats, matrix: Any, b: Floats, seconds: float | None) -> tuple[Any, Any, str]:
+def solved(
+    price: NDArray[np.float64], matrix: Any, b: NDArray[np.float64], seconds: float | None
+) -> tuple[Any, Any, str]:
     """Return x and the multipliers of an LP, and what HiGHS says where there are none."""
     from scipy.optimize import linprog
 
