@@ -20,6 +20,7 @@ from lmdsl.cli.output import Arguments, Run, narrated, print_json
 from lmdsl.cli.streams import kept
 from lmdsl.errors import LmdslError, printable, shown
 from lmdsl.machine.deadline import TimeLimitReached
+from lmdsl.results.status import Status
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,7 +43,7 @@ def _run(parsed: Arguments) -> int:
     except MemoryError:
         return _bad(parsed, "out of memory; use fewer cells, controls or sample points")
     except TimeLimitReached as error:
-        return _bad(parsed, str(error), "solver_failed", 4)
+        return _bad(parsed, str(error), Status.SOLVER_FAILED)
     except LmdslError as error:
         return _bad(parsed, str(error))
     except Exception as error:
@@ -57,7 +58,7 @@ def _fail(message: str, status: int) -> int:
     return status
 
 
-def _bad(parsed: Arguments, message: str, status: str = "bad_input", exit_status: int = 2) -> int:
+def _bad(parsed: Arguments, message: str, status: Status = Status.BAD_INPUT) -> int:
     if getattr(parsed, "json", False):
         from lmdsl.results.report import Report
 
@@ -67,7 +68,7 @@ def _bad(parsed: Arguments, message: str, status: str = "bad_input", exit_status
         elif parsed.command != "solve":
             report = {"status": status, "message": message}
         print_json(report)
-    return _fail(message, exit_status)
+    return _fail(message, status.exit_status)
 
 
 def _parser() -> argparse.ArgumentParser:

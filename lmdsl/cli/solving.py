@@ -11,6 +11,7 @@ from typing import Any
 from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
 from lmdsl.cli.streams import say, tell
 from lmdsl.errors import LmdslError, plain_text, printable
+from lmdsl.results.status import Status
 
 STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
 """Runs of the true map that follow a solve: how many, how long, and how long all together."""
@@ -163,7 +164,7 @@ def _summary(result: Any) -> str:
     ]  # fmt: skip
     if result.lp is None:  # there was no time to compile
         rows[3:6] = [("cells", str(result.cells)), ("controls", str(result.controls))]
-    elif result.status != "not_stabilizable":
+    elif result.status != Status.NOT_STABILIZABLE:
         rows += [
             ("cost", f"{number(result.cost)} (lower bound {number(result.lower_bound)})"),
             ("gap", f"{number(result.gap, '.2g')} (tolerance {number(result.tolerance, '.2g')})"),

@@ -19,6 +19,7 @@ _FIXES = {
     "bool_type": "write true or false",
     "callable_type": "give a function",
     "dict_type": "write an object in braces",
+    "enum": "write {expected}",
     "finite_number": "must be a finite number",
     "float_type": "write a number",
     "greater_than": "it must be greater than {gt}",

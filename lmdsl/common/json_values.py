@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, is_dataclass
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,8 @@ def jsonable(value: Any) -> Any:
         if math.isnan(number):
             return None
         return number if math.isfinite(number) else "inf" if number > 0 else "-inf"
+    if isinstance(value, StrEnum):
+        return value.value
     if isinstance(value, np.integer):
         return int(value)
     return value

@@ -28,10 +28,9 @@ from lmdsl.model.grid import boxes
 from lmdsl.model.grid.boxes import Region
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.problem.problem import Problem
 
-LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
 MEANING = {
     CellStatus.ESCAPES: "every control sends some sample out of the box, into avoid, or to "
     "a value that is not finite",

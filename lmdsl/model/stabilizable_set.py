@@ -44,6 +44,9 @@ class CellStatus(IntEnum):
     BEYOND_GAMMA = 6
 
 
+LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
+
+
 @dataclass(frozen=True, eq=False)
 class Predecessors:
     """For every target, the pairs that can reach it: the transpose of the rows' pattern.

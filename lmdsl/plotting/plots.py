@@ -33,6 +33,7 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.plotting import layers, runs
 from lmdsl.plotting.view import At, View, number, plain
 from lmdsl.problem.problem import Problem
+from lmdsl.results.status import Cause, Status
 
 if TYPE_CHECKING:
     import os
@@ -149,7 +150,7 @@ def cost(
     matplotlib.axes.Axes
     """
     view = _view(result, axes, at)
-    solved = result.status != "not_stabilizable"
+    solved = result.status != Status.NOT_STABILIZABLE
     optimal = "optimal cost" if result.problem.controls else "cost"
     word = optimal if result.verified else "cost, not verified" if solved else "causes"
     drawn: Axes = layers.frame(ax, view, word + view.note)
@@ -456,9 +457,9 @@ def _codes(result: Result) -> NDArray[np.uint8]:
     """Return the region of every cell: its status, or what a refusal says of it."""
     code = result.cell_status.copy()
     free = code == CellStatus.STABILIZED
-    if result.status == "not_stabilizable":
+    if result.status == Status.NOT_STABILIZABLE:
         code[free] = layers.UNSOLVED
-        if result.cause == "gamma":
+        if result.cause == Cause.GAMMA:
             code[free & (result.witness > 0)] = layers.INFINITE
     return code
 

@@ -20,6 +20,7 @@ from lmdsl.problem.problem import Problem
 from lmdsl.results.job import not_compiled
 from lmdsl.results.result import Result
 from lmdsl.results.solving import TOLERANCE, solve
+from lmdsl.results.status import Status
 
 BACKENDS = ("policy-iteration", "highs", "clarabel", "cvxpy")
 """Compared where none is named: those that every installation has."""
@@ -87,7 +88,7 @@ class Comparison:
         lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
         lines.insert(1, "  ".join("-" * w for w in widths))
         for result in self.results:
-            if result.status != "verified":
+            if result.status != Status.VERIFIED:
                 lines.append(printable(f"{result.backend}: {result.message}"))
         if self.agreement:
             a = self.agreement
@@ -164,7 +165,7 @@ def compare(
         solve(lp, backend, tolerance=tolerance, time_limit=time_limit, progress=progress)
         for backend in backends
     )
-    return Comparison(results, _agreement(lp, [r for r in results if r.status == "verified"]))
+    return Comparison(results, _agreement(lp, [r for r in results if r.status == Status.VERIFIED]))
 
 
 def _agreement(lp: StabilizationLP, results: list[Result]) -> Agreement | None:

@@ -22,6 +22,7 @@ from lmdsl.problem.problem import Problem
 from lmdsl.results.polishing import _Outcome
 from lmdsl.results.report import Coverage, Seconds
 from lmdsl.results.result import Result
+from lmdsl.results.status import Cause, Status
 
 UNKNOWN = 255
 """Status of cells of which nothing is known."""
@@ -36,7 +37,7 @@ def not_compiled(
     message = str(error)
     claims = Certificate(*(False,) * 5, *(None,) * 5, tolerance=tolerance, reasons=(message,))
     return Result(
-        status="solver_failed",
+        status=Status.SOLVER_FAILED,
         backend=backend if isinstance(backend, str) else backend.name,
         solver_status="time limit",
         gamma=problem.gamma,
@@ -78,7 +79,7 @@ class _Job:
 
     def refused(
         self,
-        cause: str,
+        cause: Cause,
         message: str,
         verified: Verified | None = None,
         gamma_bar: tuple[float, float] | None = None,
@@ -88,7 +89,12 @@ class _Job:
             verified = Verified(checks.check(self.lp, witness, self.tolerance), witness)
         proof = replace(verified.certificate, reasons=(message,))
         return self._result(
-            verified.witness, proof, "not_stabilizable", message, cause=cause, gamma_bar=gamma_bar
+            verified.witness,
+            proof,
+            Status.NOT_STABILIZABLE,
+            message,
+            cause=cause,
+            gamma_bar=gamma_bar,
         )
 
     def restricted(self, inner: Result, w: NDArray[np.float64]) -> Result:
@@ -106,7 +112,7 @@ class _Job:
     ) -> Result:
         proof = verified.certificate
         if proof.verified:
-            status = "verified"
+            status = Status.VERIFIED
             free = Coverage.of(self.lp.cell_status).free
             message = (
                 f"the controller brings every one of {self.lp.n} cells (of {free} free) to the "
@@ -114,7 +120,7 @@ class _Job:
             )
         else:
             failed = not solution.stop.success and not undecided
-            status = "solver_failed" if failed else "unverified"
+            status = Status.SOLVER_FAILED if failed else Status.UNVERIFIED
             message = "; ".join(proof.reasons)
             if failed:
                 message = f"{solution.stop.value} ({solution.word}); {message}"
@@ -136,7 +142,7 @@ class _Job:
         )
 
     def _result(
-        self, witness: Witness, proof: Certificate, status: str, message: str, **more: Any
+        self, witness: Witness, proof: Certificate, status: Status, message: str, **more: Any
     ) -> Result:
         lp, n = self.lp, self.lp.n
 
@@ -147,7 +153,7 @@ class _Job:
         index = np.full(lp.partition.size, -1, dtype=np.int32)
         if witness.policy is not None:
             index[lp.cells] = lp.control[witness.policy]
-        solved = status != "not_stabilizable"
+        solved = status != Status.NOT_STABILIZABLE
         attractor = lp.cell_status == CellStatus.ATTRACTOR
         local = LocalController.of(lp.problem, lp.partition, attractor)
         return Result(

@@ -14,8 +14,7 @@ from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.simulation import Simulation
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.stabilizable_set import CellStatus
-
-EXIT = {"verified": 0, "unverified": 1, "bad_input": 2, "not_stabilizable": 3, "solver_failed": 4}
+from lmdsl.results.status import Status
 
 
 @dataclass(frozen=True)
@@ -96,7 +95,7 @@ class Report(Frozen):
         Runs of the true map that ``lmdsl solve`` made; None where none was asked for.
     """
 
-    status: str
+    status: Status
     backend: str | None = None
     solver_status: str | None = None
     gamma: float | None = None
@@ -119,20 +118,13 @@ class Report(Frozen):
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
-        covered, runs = self.coverage, self.simulation
-        return {
-            **self.stored(),
-            "coverage": covered and covered.to_dict(),
-            "simulation": runs and jsonable(runs.to_dict()),
-        }
-
-    def stored(self) -> dict[str, Any]:
-        """Return the part of the data that certificate.json keeps."""
+        covered, beyond, runs = self.coverage, self.beyond_gamma, self.simulation
         names = [f.name for f in fields(Report) if f.name != "simulation"]
-        cells = self.beyond_gamma
         return {
             **{name: jsonable(getattr(self, name)) for name in names},
-            "beyond_gamma": cells and cells.to_dict(),
+            "beyond_gamma": beyond and beyond.to_dict(),
+            "coverage": covered and covered.to_dict(),
+            "simulation": runs and jsonable(runs.to_dict()),
         }
 
     @property
@@ -148,4 +140,4 @@ class Report(Frozen):
     @property
     def exit_status(self) -> int:
         """Exit status of the command line."""
-        return EXIT[self.status]
+        return Status(self.status).exit_status

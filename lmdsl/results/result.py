@@ -29,6 +29,7 @@ from lmdsl.model.sets import Regions
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.results.report import Coverage, Report
+from lmdsl.results.status import Cause
 from lmdsl.systems.named import NotStored
 
 if TYPE_CHECKING:
@@ -114,7 +115,7 @@ class Result(Report):
     iterations: int | None = None
     log: str = ""
     gap_before_polish: float | None = None
-    cause: str | None = None
+    cause: Cause | None = None
     lp: StabilizationLP | None = None
     model_sha256: str = ""
 
@@ -147,7 +148,7 @@ class Result(Report):
     def beyond_gamma(self) -> Area | None:
         """The cells proved infeasible at this gamma, by region; None where none is."""
         mask = self.cell_status == CellStatus.BEYOND_GAMMA
-        if self.cause == "gamma":
+        if self.cause == Cause.GAMMA:
             mask = mask | (self.witness > 0)
         return Area.of(self.partition, np.flatnonzero(mask)) if mask.any() else None
 

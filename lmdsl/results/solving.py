@@ -19,12 +19,14 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.lp import StabilizationLP, compile
+from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility import first_policy, gamma_bar, restriction
 from lmdsl.optimize.witness import certify
 from lmdsl.problem.problem import Problem
 from lmdsl.results.job import _Job, not_compiled
 from lmdsl.results.polishing import _polish
 from lmdsl.results.result import Result
+from lmdsl.results.status import Cause
 
 TOLERANCE = 1e-6
 
@@ -119,7 +121,7 @@ def solve(
             limits = gamma_bar.bracket(lp, late, start=first.best)
             bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
             message = restriction.refusal_message(lp, w, limits, bracket)
-            return job.refused("gamma", message, verified, bracket)
+            return job.refused(Cause.GAMMA, message, verified, bracket)
         first = first_policy.Undecided(first.best.policy, first.lower)
     options = Options(
         tolerance=tolerance,
@@ -165,18 +167,22 @@ def _number(value: Any) -> bool:
     return isinstance(value, float | int | np.floating | np.integer) and value is not True
 
 
-def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[str, str] | None:
+def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[Cause, str] | None:
     """Return the cause and a sentence where the graph alone rules the problem out."""
     if not lp.n:
-        if not np.isin(lp.cell_status, (2, 3, 4)).any():
-            return "empty", "every cell is attractor or avoid; there is nothing to stabilize"
-        return "empty", "no cell can be kept in the box and brought to the attractor"
+        if not np.isin(lp.cell_status, LOST).any():
+            return Cause.EMPTY, "every cell is attractor or avoid; there is nothing to stabilize"
+        return Cause.EMPTY, "no cell can be kept in the box and brought to the attractor"
     if not lp.weight.any():
-        return "measure", "no cell of measure is stabilizable; enlarge its boxes"
-    outside = lp.partition.size - lp.n - int(np.isin(lp.cell_status, (0, 5)).sum())
+        return Cause.MEASURE, "no cell of measure is stabilizable; enlarge its boxes"
+    outside = (
+        lp.partition.size
+        - lp.n
+        - int(np.isin(lp.cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID)).sum())
+    )
     if require_all and outside:
         return (
-            "require_all",
+            Cause.REQUIRE_ALL,
             f"{outside} of {lp.n + outside} cells outside A and Z are not stabilizable",
         )
     return None

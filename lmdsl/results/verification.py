@@ -29,15 +29,15 @@ from lmdsl.model.discretization import noise_nodes, sample_points
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.rows import Rows, Shares
 from lmdsl.model.sets import Regions
-from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory import archive
 from lmdsl.results.directory.audit import differences, function_differences, local_differences
 from lmdsl.results.result import Result
+from lmdsl.results.status import Cause, Status
 from lmdsl.systems import FunctionSystem
 
 Judge = Callable[[StabilizationLP, Witness, float], Certificate]
-LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Verification:
     """
 
     holds: bool
-    status: str
+    status: Status
     same_model: bool
     certificate: Certificate
     reasons: tuple[str, ...]
@@ -85,7 +85,7 @@ class Verification:
         proof = self.certificate
         return {
             "holds": self.holds,
-            "status": self.status,
+            "status": self.status.value,
             "same_model": self.same_model,
             "claims": {name: getattr(proof, name) for name in (*CLAIMS, "refusal")},
             "cost": jsonable(proof.cost),
@@ -153,11 +153,11 @@ def verify(
         notes.append("the recompiled model differs from the stored one; claims are judged on it")
     if not np.array_equal(lp.cell_status, result.cell_status):
         reasons.append("cell_status differs from the recompiled model")
-    if result.status == "not_stabilizable":
+    if result.status == Status.NOT_STABILIZABLE:
         certificate = _judge_refusal(lp, result, reasons, judge)
     else:
         certificate = _judge_claims(lp, result, reasons, judge)
-        if result.status != "verified":
+        if result.status != Status.VERIFIED:
             reasons.append(f"the status is {result.status}, not verified")
     reasons += differences(whole, lp, result, held.certificate, certificate)
     in_time()
@@ -210,12 +210,12 @@ def _judge_refusal(
     witness = Witness(None, result.witness[lp.cells])
     certificate = judge(lp, witness, result.tolerance or 0.0)
     proved = {
-        "empty": not lp.n,
-        "measure": bool(lp.n) and not lp.weight.any(),
-        "require_all": bool(np.isin(lp.cell_status, LOST).any()),
-        "gamma": certificate.refusal,
+        Cause.EMPTY: not lp.n,
+        Cause.MEASURE: bool(lp.n) and not lp.weight.any(),
+        Cause.REQUIRE_ALL: bool(np.isin(lp.cell_status, LOST).any()),
+        Cause.GAMMA: certificate.refusal,
     }
-    if not proved.get(result.cause or "", False):
+    if result.cause is None or not proved[result.cause]:
         reasons.append(f"the refusal ({result.cause}) is not proved by the recompiled model")
     return certificate
 

@@ -41,7 +41,7 @@ from lmdsl.formulas.language import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
 from lmdsl.problem import problem
 from lmdsl.results import comparison
 from lmdsl.results.directory import archive
-from lmdsl.results.report import EXIT
+from lmdsl.results.status import Status
 from lmdsl.systems import NAMED
 from lmdsl.testing.checks import CHECKS
 
@@ -272,7 +272,7 @@ def test_the_whole_formula_language_is_described():
 def test_outputs_are_described():
     text = doc("command-line.md")
     result = lm.solve(lm.load(ROOT / "examples/logistic_map.json"))
-    assert not missing([*result.to_dict(), *EXIT], section(text, "## `lmdsl solve`"))
+    assert not missing([*result.to_dict(), *Status], section(text, "## `lmdsl solve`"))
     directory = section(text, "## The result directory")
     stored = archive._certificate(result)
     assert not missing(set(stored) - set(result.to_dict()), directory)
@@ -290,7 +290,7 @@ def test_outputs_are_described():
 
 def test_statuses_are_explained():
     tutorial = section(doc("tutorial.md"), "## What a status means")
-    for status, code in EXIT.items():
+    for code, status in enumerate(Status):
         assert f"| `{status}` | {code} |" in tutorial
 
 

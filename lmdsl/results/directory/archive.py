@@ -10,10 +10,9 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-import sys
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +23,20 @@ from lmdsl.certificate.claims import CLAIMS, Certificate
 from lmdsl.common import arrays
 from lmdsl.common.files import MAX_FILE_BYTES, parsed, reason
 from lmdsl.common.json_values import jsonable
-from lmdsl.control.invariance import LocalCheck
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem, parse_problem
 from lmdsl.results.directory import reading, writing
+from lmdsl.results.directory.certificate_file import SCOPE, CertificateFile
 from lmdsl.results.directory.reading import FORMAT, Reading
-from lmdsl.results.report import EXIT, Report, Seconds
 from lmdsl.results.result import ARRAYS, Result
 from lmdsl.systems import FunctionSystem
 from lmdsl.systems.named import NotStored
 
-SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
 TYPES = {
     "control_index": "<i4",
     "value": "<f8",
@@ -107,19 +105,20 @@ def _contents(result: Result) -> dict[str, bytes]:
 
 
 def _certificate(result: Result) -> dict[str, Any]:
-    proof = result.certificate
-    return {
+    proof, beyond = result.certificate, result.beyond_gamma
+    apart = {
         "format": FORMAT,
-        **result.stored(),
-        "cause": result.cause,
+        "beyond_gamma": beyond and beyond.to_dict(),
         "claims": {name: getattr(proof, name) for name in (*CLAIMS, "refusal")},
-        "measure_residual": jsonable(proof.measure_residual),
-        "reasons": list(proof.reasons),
-        "iterations": jsonable(result.iterations),
-        "gap_before_polish": jsonable(result.gap_before_polish),
+        "measure_residual": proof.measure_residual,
+        "reasons": proof.reasons,
         "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
         "versions": versions(),
         "scope": SCOPE,
+    }
+    return {
+        key: jsonable(apart[key] if key in apart else getattr(result, key))
+        for key in CertificateFile.model_fields
     }
 
 
@@ -186,7 +185,7 @@ class Stored:
     """
 
     result: Result
-    certificate: dict[str, Any]
+    certificate: CertificateFile
     rewritten: tuple[str, ...]
 
 
@@ -227,7 +226,7 @@ def _arrays(files: Reading, name: str, expected: arrays.Expected) -> dict[str, N
 def _read(files: Reading) -> Stored:
     content = files.open("problem.json", MAX_FILE_BYTES).read()
     problem = _problem(parsed(files.folder / "problem.json", content))
-    stored = read_certificate(files.certificate)
+    stored = CertificateFile.read(files.certificate)
     partition = Partition.of(problem)
     N = partition.size
     M = min(control_count(problem), 10**40)
@@ -238,63 +237,33 @@ def _read(files: Reading) -> Stored:
 
 
 def _result(
-    problem: Problem, partition: Partition, stored: dict[str, Any], held: dict[str, NDArray[Any]]
+    problem: Problem, partition: Partition, stored: CertificateFile, held: dict[str, NDArray[Any]]
 ) -> Result:
     vectors = control_vectors(problem)
     index = held["control_index"]
     if index.size and not (index.min() >= -1 and index.max() < len(vectors)):
         raise BadInput("control_index holds an index outside the control grid", "solution.npz")
-    if held["cell_status"].max(initial=0) > 6:
+    if held["cell_status"].max(initial=0) > max(CellStatus):
         raise BadInput("cell_status holds an unknown code", "solution.npz")
-    scalars = {
-        key: stored[key]
-        for key in Report.__dataclass_fields__
-        if key in stored and key not in ("seconds", "gamma_bar", "local_controller")
-    }
-    claims = stored["claims"]
+    said = dict(stored)
+    known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said} | held
     certificate = Certificate(
-        **{name: claims.get(name) is True for name in (*CLAIMS, "refusal")},
-        contraction=stored["contraction"],
-        cost=stored["cost"],
-        lower=stored["lower_bound"],
-        gap=stored["gap"],
-        measure_residual=stored["measure_residual"],
-        tolerance=stored["tolerance"],
-        reasons=tuple(stored["reasons"]),
+        **{name: stored.claims.get(name, False) for name in (*CLAIMS, "refusal")},
+        contraction=stored.contraction,
+        cost=stored.cost,
+        lower=stored.lower_bound,
+        gap=stored.gap,
+        measure_residual=stored.measure_residual,
+        tolerance=stored.tolerance,
+        reasons=stored.reasons,
     )
-    bracket = stored["gamma_bar"]
-    known: dict[str, Any] = {**scalars, **held}
     return Result(
         **known,
-        gamma_bar=(float(bracket[0]), float(bracket[1])) if bracket else None,
-        local_controller=_local(stored.get("local_controller")),
-        seconds=Seconds(**stored["seconds"]),
         problem=problem,
         partition=partition,
         certificate=certificate,
         control_vectors=vectors,
-        iterations=stored["iterations"],
-        gap_before_polish=stored["gap_before_polish"],
-        cause=stored["cause"],
-        model_sha256=stored["model_sha256"],
     )
-
-
-def _local(stored: Any) -> LocalCheck | None:
-    """Read what a certificate says of the local controller; results before it say nothing."""
-    if stored is None:
-        return None
-    kinds: dict[str, Any] = {"kind": str, "cells": int, "samples": int, "kept": int}
-    kinds |= {"multiplier": _NUMBER, "proved": (int, type(None))}
-    sound = isinstance(stored, dict) and set(stored) == set(kinds)
-    if not sound or not all(
-        isinstance(stored[key], kind) and not isinstance(stored[key], bool)
-        for key, kind in kinds.items()
-    ):
-        raise BadInput("not what lmdsl writes", "certificate.json.local_controller")
-    if not _finite(stored["multiplier"]):
-        raise BadInput("multiplier is out of range", "certificate.json.local_controller")
-    return LocalCheck(**stored)
 
 
 def _problem(data: Any) -> Problem:
@@ -309,71 +278,3 @@ def _problem(data: Any) -> Problem:
 
 def _not_stored(**values: Any) -> Any:
     raise NotStored("this result came from a Python function, which a directory does not hold")
-
-
-_NUMBER = (float, int, type(None))
-_SHAPE: dict[str, Any] = {
-    "status": str,
-    "backend": (str, type(None)),
-    "solver_status": (str, type(None)),
-    "gamma": _NUMBER,
-    "cost": _NUMBER,
-    "lower_bound": _NUMBER,
-    "gap": _NUMBER,
-    "tolerance": (float, int),
-    "contraction": _NUMBER,
-    "gamma_bar": (list, type(None)),
-    "polish_steps": (int, type(None)),
-    "message": str,
-    "cause": (str, type(None)),
-    "claims": dict,
-    "measure_residual": (float, int, str, type(None)),
-    "reasons": list,
-    "iterations": (int, type(None)),
-    "gap_before_polish": _NUMBER,
-    "model_sha256": str,
-    "seconds": dict,
-    "cells": int,
-    "controls": int,
-    "pairs": int,
-    "attractor_cells": int,
-    "stabilizable_cells": int,
-}
-
-
-def _finite(value: Any) -> bool:
-    """Return whether a stored number is unknown or within the range of doubles."""
-    if value is None:
-        return True
-    if not isinstance(value, float | int) or isinstance(value, bool):
-        return False
-    return abs(value) <= sys.float_info.max
-
-
-def read_certificate(data: dict[str, Any]) -> dict[str, Any]:
-    """Check that every key of certificate.json has its type."""
-    where = reading.COMMIT
-    if data.get("format") != FORMAT:
-        raise BadInput(f"not a certificate of format {FORMAT}", where)
-    for key, kinds in _SHAPE.items():
-        if key not in data or not isinstance(data[key], kinds) or isinstance(data[key], bool):
-            raise BadInput(f"{key} is missing or of the wrong type", where)
-    for key, kinds in _SHAPE.items():
-        if kinds in (_NUMBER, (float, int)) and not _finite(data[key]):
-            raise BadInput(f"{key} is out of range", where)
-    if data["tolerance"] < 0:
-        raise BadInput("tolerance is negative", where)
-    if data["status"] not in EXIT:
-        raise BadInput(f"{shown(data['status'])} is not a status", f"{where}.status")
-    seconds = data["seconds"]
-    fields = set(Seconds.__dataclass_fields__)
-    if set(seconds) != fields or not all(_finite(v) for v in seconds.values()):
-        raise BadInput("seconds needs compile, solve and verify", where)
-    bracket = data["gamma_bar"]
-    if bracket is not None and not (
-        len(bracket) == 2 and all(x == "inf" or (x is not None and _finite(x)) for x in bracket)
-    ):
-        raise BadInput("gamma_bar is null or [low, high]", where)
-    if not all(isinstance(reason, str) for reason in data["reasons"]):
-        raise BadInput("reasons are sentences", where)
-    return data

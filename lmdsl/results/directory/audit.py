@@ -19,8 +19,10 @@ from lmdsl.model.local_controller import LocalController
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.optimize.feasibility import gamma_bar
-from lmdsl.results.directory.archive import SCOPE, identity
+from lmdsl.results.directory.archive import identity
+from lmdsl.results.directory.certificate_file import SCOPE, CertificateFile
 from lmdsl.results.result import Result
+from lmdsl.results.status import Cause, Status
 from lmdsl.systems import FunctionSystem
 
 NOT_CLAIMED = (
@@ -41,7 +43,7 @@ def differences(
     whole: StabilizationLP,
     lp: StabilizationLP,
     result: Result,
-    certificate: dict[str, Any],
+    certificate: CertificateFile,
     found: Certificate,
 ) -> list[str]:
     """Return where a certificate says something else than what was found, one sentence each.
@@ -56,20 +58,20 @@ def differences(
         The claims as judged now.
     """
     reasons = [*_counts(lp, result), *_numbers(result, found), *_outside(lp, result)]
-    claims = certificate["claims"]
+    claims = certificate.claims
     for name in (*CLAIMS, "refusal"):
         if claims.get(name) is not getattr(found, name):
             reasons.append(_differs(f"claims.{name}", claims.get(name), getattr(found, name)))
-    reasons += _residual(lp, result, certificate["measure_residual"], found)
-    if result.status == "verified" and certificate["reasons"]:
+    reasons += _residual(lp, result, certificate.measure_residual, found)
+    if result.status == Status.VERIFIED and certificate.reasons:
         reasons.append("reasons are stored, but the status is verified")
-    if result.status != "not_stabilizable" and result.cause is not None:
+    if result.status != Status.NOT_STABILIZABLE and result.cause is not None:
         reasons.append(f"cause is stored as {result.cause!r}, but nothing was refused")
     area = result.beyond_gamma
     beyond = jsonable(area.to_dict()) if area is not None else None
-    if "beyond_gamma" in certificate and certificate["beyond_gamma"] != beyond:
+    if "beyond_gamma" in certificate.model_fields_set and certificate.beyond_gamma != beyond:
         reasons.append("beyond_gamma is not the cells that solution.npz names")
-    if certificate.get("scope", SCOPE) != SCOPE:
+    if certificate.scope != SCOPE:
         reasons.append("scope is not what verified speaks of")
     return reasons + _bracket(whole, result, found)
 
@@ -102,7 +104,7 @@ def _numbers(result: Result, found: Certificate) -> list[str]:
         "gap": found.gap,
         "contraction": found.contraction,
     }
-    if result.status == "not_stabilizable":
+    if result.status == Status.NOT_STABILIZABLE:
         now = dict.fromkeys(now)
     reasons = []
     for name, true in now.items():
@@ -120,14 +122,16 @@ def _numbers(result: Result, found: Certificate) -> list[str]:
     return reasons
 
 
-def _residual(lp: StabilizationLP, result: Result, stored: Any, found: Certificate) -> list[str]:
+def _residual(
+    lp: StabilizationLP, result: Result, stored: float | None, found: Certificate
+) -> list[str]:
     true = found.measure_residual
-    if isinstance(stored, float | int) and true is not None and np.isfinite(true):
+    if stored is not None and true is not None and np.isfinite(true):
         with np.errstate(over="ignore", invalid="ignore"):
             scale = max(1.0, float(result.measure[lp.cells].sum()))
         if -1e-12 * scale <= stored - true <= MEASURE_TOLERANCE * scale and stored >= 0:
             return []
-    elif stored == jsonable(true):
+    elif stored == true:
         return []
     return [_differs("measure_residual", stored, true)]
 
@@ -147,7 +151,7 @@ def _outside(lp: StabilizationLP, result: Result) -> list[str]:
     for name, on_attractor, off, refused in expected:
         array = getattr(result, name)
         sound = (array[attractor] == on_attractor).all() and (array[outside] == off).all()
-        if result.status == "not_stabilizable":
+        if result.status == Status.NOT_STABILIZABLE:
             sound = sound and (array[lp.cells] == refused).all()
         if not sound:
             reasons.append(f"{name} has a wrong value where there is none to give")
@@ -160,7 +164,7 @@ def _bracket(whole: StabilizationLP, result: Result, found: Certificate) -> list
     """Prove the stored bracket of gamma_bar again, with vectors of our own."""
     stored = result.gamma_bar
     if stored is None:
-        if result.cause == "gamma":
+        if result.cause == Cause.GAMMA:
             return ["gamma_bar is stored as null, but gamma was refused because of it"]
         return []
     low, high = gamma_bar.enclosed(whole, *stored)
@@ -175,11 +179,11 @@ def _bracket(whole: StabilizationLP, result: Result, found: Certificate) -> list
 
 
 def local_differences(
-    lp: StabilizationLP, result: Result, certificate: dict[str, Any], late: Deadline
+    lp: StabilizationLP, result: Result, certificate: CertificateFile, late: Deadline
 ) -> list[str]:
     """Return where the local controller does less than the directory says."""
     stored, problem = result.local_controller, result.problem
-    if "local_controller" not in certificate:
+    if "local_controller" not in certificate.model_fields_set:
         return []
     if stored is None or problem.local_controller is None:
         if stored is None and problem.local_controller is None:
@@ -226,10 +230,11 @@ def function_differences(lp: StabilizationLP, result: Result) -> list[str]:
 
     reasons, status = [], result.cell_status
     regions = Regions.of(result.problem, result.partition)
-    for code, mask in ((0, regions.attractor), (5, regions.avoid)):
+    for code, mask in (
+        (CellStatus.ATTRACTOR, regions.attractor), (CellStatus.AVOID, regions.avoid),
+    ):  # fmt: skip
         if not np.array_equal(status == code, mask):
-            name = ("attractor", "avoid")[code == 5]
-            reasons.append(f"cell_status differs from the {name} of the problem")
+            reasons.append(f"cell_status differs from the {code.name.lower()} of the problem")
     cost = _costs(lp)
     with np.errstate(invalid="ignore"):
         wrong = ~(np.abs(lp.cost - cost) <= 1e-9 * np.abs(cost))

@@ -22,6 +22,7 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory.writing import refuse_own_file
 from lmdsl.results.result import Result
+from lmdsl.results.status import Cause, Status
 
 FORMAT = "lmdsl-certificate/1"
 VECTORS = {"V_up": "value", "W": "lower", "w": "witness", "mu": "measure"}
@@ -50,8 +51,8 @@ def export_certificate(
         model, or the file cannot be written.
     """
     inputs.kind(result, Result, "result", "a Result")
-    refused = result.status == "not_stabilizable"
-    if refused and result.cause != "gamma":
+    refused = result.status == Status.NOT_STABILIZABLE
+    if refused and result.cause != Cause.GAMMA:
         raise BadInput(
             f"this refusal ({result.cause}) follows from the graph of the model, not from vectors; "
             "`lmdsl verify` checks it"

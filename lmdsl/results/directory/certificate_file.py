@@ -1,0 +1,95 @@
+"""The keys of certificate.json, in order: what a directory says of its result.
+
+Beside them stand ``save`` and ``files``, which hold the files of a save together (reading.py).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
+
+from pydantic import BeforeValidator, ConfigDict, Field, create_model
+
+from lmdsl.common.files import joined
+from lmdsl.common.strict_model import Declared, plain
+from lmdsl.control.invariance import LocalCheck
+from lmdsl.errors import BadInput
+from lmdsl.results.directory.reading import COMMIT
+from lmdsl.results.report import Seconds
+from lmdsl.results.status import Cause, Status
+
+SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
+
+T = TypeVar("T")
+Word = Annotated[T, Field(strict=False)]
+"""A member of an enum, by its value."""
+List = Annotated[tuple[T, ...], BeforeValidator(plain)]
+Bound = Annotated[
+    float,
+    Field(allow_inf_nan=True),
+    BeforeValidator(lambda value: math.inf if value == "inf" else value),
+]
+"""A number, or ``"inf"``."""
+
+
+class _Keys(Declared):
+    model_config = ConfigDict(allow_inf_nan=False)
+
+
+def _record(kind: type[Any]) -> BeforeValidator:
+    """Read a dataclass of ours from an object with just its keys."""
+    hints: dict[str, Any] = get_type_hints(kind)
+    keys: Any = {field.name: (hints[field.name], ...) for field in fields(kind)}
+    model = create_model(kind.__name__, __base__=_Keys, **keys)
+
+    def read(value: Any) -> Any:
+        return value if value is None else kind(**dict(model.model_validate(value)))
+
+    return BeforeValidator(read)
+
+
+class CertificateFile(_Keys):
+    """What certificate.json says; keys that came later have a default, others are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    format: Literal["lmdsl-result/1"]
+    status: Word[Status]
+    backend: str | None
+    solver_status: str | None
+    gamma: float | None
+    cost: float | None
+    lower_bound: float | None
+    gap: float | None
+    tolerance: Annotated[float, Field(ge=0)]
+    contraction: float | None
+    gamma_bar: Annotated[tuple[Bound, Bound] | None, BeforeValidator(plain)]
+    cells: int
+    controls: int
+    pairs: int
+    attractor_cells: int
+    stabilizable_cells: int
+    polish_steps: int | None
+    seconds: Annotated[Seconds, _record(Seconds)]
+    message: str
+    local_controller: Annotated[LocalCheck | None, _record(LocalCheck)] = None
+    beyond_gamma: dict[str, Any] | None = None
+    cause: Word[Cause | None]
+    claims: dict[str, bool]
+    measure_residual: Bound | None
+    reasons: List[str]
+    iterations: int | None
+    gap_before_polish: float | None
+    model_sha256: str
+    versions: dict[str, str] = Field(default_factory=dict)
+    scope: str = SCOPE
+
+    @classmethod
+    def read(cls, data: dict[str, Any]) -> CertificateFile:
+        """Check that every key has its type."""
+        try:
+            found: CertificateFile = cls.model_validate(data)
+        except BadInput as error:
+            raise BadInput(error.message, joined(COMMIT, error.where)) from None
+        return found
