@@ -13,7 +13,7 @@ from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.certificate.sums import rounded_up, total_above
 from lmdsl.common.types import Floats, Pairs
 from lmdsl.machine import threads
-from lmdsl.model import reachability
+from lmdsl.model import algorithm_1
 from lmdsl.model.lp import StabilizationLP
 
 MEASURE_TOLERANCE = 1e-9
@@ -235,7 +235,7 @@ def _too_small(cost: float | None) -> str:
 
 
 def _not_stabilizing(lp: StabilizationLP, policy: Pairs) -> str:
-    lost = int((~reachability.reaches_attractor(lp, policy)).sum())
+    lost = int((~algorithm_1.reaches_attractor(lp, policy)).sum())
     if lost and lp.gamma < 1:
         return (
             f"from {lost} of {lp.n} cells the policy never reaches the attractor: at gamma = "

@@ -32,10 +32,11 @@ from lmdsl.errors import LmdslError, shown
 from lmdsl.explanation.one_cell import NAMES
 from lmdsl.machine import apart, linprog, memory
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.grid import boxes
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.stabilizable_set import CellStatus, owner
+from lmdsl.model.stabilizable_set import CellStatus
 
 SMALL = 1e-6
 MOST_CELLS = 100

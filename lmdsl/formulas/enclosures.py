@@ -25,7 +25,7 @@ import numpy as np
 
 from lmdsl.formulas import intervals as iv
 from lmdsl.formulas.intervals import Interval
-from lmdsl.formulas.language import FORMULA_FUNCTIONS
+from lmdsl.formulas.operations import FORMULA_FUNCTIONS
 
 
 class Jet:

@@ -7,7 +7,8 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from lmdsl.common.strict_model import Number, SchemaWords, frozen_dict, plain
-from lmdsl.formulas.language import MAX_CHARACTERS, MAX_NAME, RESERVED, check_name
+from lmdsl.formulas.language import MAX_CHARACTERS, MAX_NAME, check_name
+from lmdsl.formulas.operations import RESERVED
 
 
 def _named(value: dict[str, Any]) -> dict[str, Any]:

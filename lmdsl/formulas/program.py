@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from lmdsl.common.types import Check
 from lmdsl.errors import BadInput
 from lmdsl.formulas.enclosures import Jet, apply
-from lmdsl.formulas.language import OPERATIONS, PLAIN, Formula, Step, fold
+from lmdsl.formulas.language import Formula, Step, fold
+from lmdsl.formulas.operations import OPERATIONS, PLAIN
 
 
 class Instruction(NamedTuple):

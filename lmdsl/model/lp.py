@@ -22,7 +22,8 @@ from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.model import stabilizable_set
+from lmdsl.model import algorithm_1, stabilizable_set
+from lmdsl.model.algorithm_1 import Predecessors
 from lmdsl.model.assembly.transitions import assemble, require_least, unless_short
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.directions import Directions
@@ -30,7 +31,7 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local_controller import LocalController
 from lmdsl.model.rows import Rows
 from lmdsl.model.sets import Regions
-from lmdsl.model.stabilizable_set import CellStatus, Predecessors
+from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 
 
@@ -93,7 +94,7 @@ class StabilizationLP(Frozen):
     @cached_property
     def cell(self) -> NDArray[np.int32]:
         """The cell of every column as a position in ``cells``, shape (K,)."""
-        cell = stabilizable_set.owner(self.pair_pointer)
+        cell = algorithm_1.owner(self.pair_pointer)
         freeze(cell)
         return cell
 
@@ -195,7 +196,7 @@ class StabilizationLP(Frozen):
     @cached_property
     def _algorithm_1(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         """The same as our own code reads it: compiled loops tell read-only arrays from others."""
-        return stabilizable_set.tree(self.pair_pointer, self.rows)
+        return algorithm_1.tree(self.pair_pointer, self.rows)
 
     @property
     def kernel(self) -> tuple[NDArray[Any], ...]:

@@ -20,14 +20,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.machine import memory, threads
+from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
-from lmdsl.machine.kernels import ONE, fixed, kernel
+from lmdsl.machine.kernels import kernel
+from lmdsl.model.algorithm_1 import Predecessors, _tree, owner
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.rows import Rows
 
@@ -45,33 +45,6 @@ class CellStatus(IntEnum):
 
 
 LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
-
-
-@dataclass(frozen=True, eq=False)
-class Predecessors:
-    """For every target, the pairs that can reach it: the transpose of the rows' pattern.
-
-    Attributes
-    ----------
-    pointer
-        Shape (columns + 2,): pairs that reach j are ``pair[pointer[j]:pointer[j + 1]]``; the
-        attractor is the last j.
-    pair
-        Pair indices, int32 (int64 where needed), ascending for each target.
-    """
-
-    pointer: NDArray[np.int64]
-    pair: NDArray[Any]
-
-    @classmethod
-    def of(cls, rows: Rows) -> Predecessors:
-        """Transpose the pattern of rows."""
-        memory.require(8 * len(rows.target) + 16 * rows.columns + 8 * rows.count, "predecessors")
-        pointer = np.zeros(rows.columns + 2, dtype=np.int64)
-        small = rows.count < 2**31
-        pair = np.empty(len(rows.target), dtype=np.int32 if small else np.int64)
-        _transpose(rows.pointer, rows.target, pointer, pair)
-        return cls(pointer, pair)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,78 +103,6 @@ def causes(found: Stabilizable, pair_pointer: NDArray[np.int64]) -> NDArray[np.u
     return status
 
 
-def tree(
-    pair_pointer: NDArray[np.int64],
-    rows: Rows,
-    allowed: NDArray[np.bool_] | None = None,
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Algorithm 1, corrected: breadth-first levels from A, and the pair that put a cell there.
-
-    Parameters
-    ----------
-    pair_pointer, rows
-        The pairs by cell, ordered by control, and their transitions.
-    allowed
-        Which pairs may be used; default all.
-
-    Returns
-    -------
-    level : ndarray of int32, shape (cells,)
-        Number of steps in which A can be reached; -1 where it cannot.
-    pair : ndarray of int64, shape (cells,)
-        The first pair of the cell (smallest control) that can enter the level below; -1 where
-        there is none. On the surviving pairs this policy is stabilizing: each cell has a positive
-        chance to descend, and none can leave.
-    """
-    if allowed is None:
-        allowed = np.ones(rows.count, dtype=np.bool_)
-    return _tree(pair_pointer, rows, allowed)
-
-
-PATIENCE = 8
-"""Visits per entry that sweeps may cost before predecessors are made: these cost about as much."""
-
-PARTS = 16
-"""Ranges of cells that threads work on."""
-
-SMALL = 2**20
-"""Entries of rows below which one thread is fastest."""
-
-
-def _tree(
-    pair_pointer: NDArray[np.int64],
-    rows: Rows,
-    alive: NDArray[np.bool_],
-    before: Predecessors | None = None,
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Return levels and pairs as :func:`tree`; with predecessors at hand, by these alone."""
-    cells = rows.columns
-    level = np.full(cells + 1, -1, dtype=np.int32)
-    level[cells] = 0
-    pair = np.full(cells, -1, dtype=np.int64)
-    front = level == 0
-    parts = 1 if len(rows.target) < SMALL else PARTS
-    spans = threads.ranges(cells, parts)
-    left = 0 if before else PATIENCE * len(rows.target)
-    below = 0
-
-    model = [fixed(a) for a in (pair_pointer.view(np.uint64), *rows.kernel[:2], alive, front)]
-    all_alive = bool(alive.all())
-
-    def sweep(span: tuple[int, int]) -> int:
-        return int(_sweep(*model, all_alive, below, level, pair, *span))
-
-    while left > 0 and front.any():
-        left -= sum(threads.each(sweep, spans))
-        below += 1
-        np.equal(level, below, out=front)
-    if front.any():
-        before = before or Predecessors.of(rows)
-        start = np.flatnonzero(front)
-        _search(before.pointer, before.pair, owner(pair_pointer), alive, start, level, pair)
-    return level[:-1], pair
-
-
 def restrict(
     transitions: Transitions, found: Stabilizable
 ) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64], Rows]:
@@ -234,77 +135,6 @@ def restrict(
     target, code = np.empty(entries, dtype=np.int32), np.empty(entries, dtype=rows.code.dtype)
     _keep(found.surviving, rows.pointer, rows.target, rows.code, renumber, target, code)
     return kept, pair_pointer, Rows(pointer, target, code, rows.shares, n)
-
-
-def owner(pair_pointer: NDArray[np.int64]) -> NDArray[np.int32]:
-    """Return the cell of every pair, shape (pairs,)."""
-    return np.repeat(np.arange(len(pair_pointer) - 1, dtype=np.int32), np.diff(pair_pointer))
-
-
-@kernel(allocates=True)
-def _transpose(pointer, target, out_pointer, pair):  # type: ignore[no-untyped-def]
-    for e in range(len(target)):
-        out_pointer[target[e] + 1] += 1
-    for j in range(len(out_pointer) - 1):
-        out_pointer[j + 1] += out_pointer[j]
-    position = out_pointer[:-1].copy()
-    for k in range(len(pointer) - 1):
-        for e in range(pointer[k], pointer[k + 1]):
-            j = target[e]
-            pair[position[j]] = k
-            position[j] += 1
-
-
-@kernel
-def _sweep(pair_pointer, pointer, target, alive, front, all_alive, below, level, pair, first, last):  # type: ignore[no-untyped-def]
-    """Put on level ``below + 1`` the cells first..last-1 without level that can enter the front.
-
-    Returns the number of entries visited. ``front`` is the cells on level ``below``.
-    """
-    visits = np.uint64(0)
-    for i in range(np.uint64(first), np.uint64(last)):
-        if level[i] >= 0:
-            continue
-        begin, end = pair_pointer[i], pair_pointer[i + ONE]
-        if all_alive:  # all entries of the cell at once: most cells of most sweeps do not enter
-            enters = False
-            for e in range(pointer[begin], pointer[end]):
-                enters |= front[target[e]]
-            visits += pointer[end] - pointer[begin]
-            if not enters:
-                continue
-        for k in range(begin, end):
-            if not alive[k]:
-                continue
-            enters = False
-            for e in range(pointer[k], pointer[k + ONE]):
-                enters |= front[target[e]]
-            visits += pointer[k + ONE] - pointer[k]
-            if enters:
-                level[i], pair[i] = below + 1, k
-                break
-    return visits
-
-
-@kernel(allocates=True)
-def _search(pointer, before, cell, alive, start, level, pair):  # type: ignore[no-untyped-def]
-    """Breadth-first search from the cells of the highest level so far, over predecessors."""
-    queue = np.empty(len(level), dtype=np.int64)
-    at, end = 0, len(start)
-    queue[:end] = start
-    while at < end:
-        j = queue[at]
-        at += 1
-        for e in range(pointer[j], pointer[j + 1]):
-            k = before[e]
-            if alive[k]:
-                i = cell[k]
-                if level[i] < 0:
-                    level[i], pair[i] = level[j] + 1, k
-                    queue[end] = i
-                    end += 1
-                elif level[i] == level[j] + 1 and k < pair[i]:
-                    pair[i] = k
 
 
 @kernel(allocates=True)

@@ -11,17 +11,13 @@ touching matplotlib's global state: ``ax.figure.savefig(...)``.
 from __future__ import annotations
 
 import math
-import textwrap
-import warnings
 from collections.abc import Mapping, Sequence
-from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lmdsl.common import inputs
-from lmdsl.common.files import write_whole
 from lmdsl.common.types import Floats
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
@@ -30,23 +26,16 @@ from lmdsl.model.discretization import control_values
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import Regions
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.plotting import layers, runs
+from lmdsl.plotting import layers, overlays, runs
 from lmdsl.plotting.view import At, View, number, plain
 from lmdsl.problem.problem import Problem
 from lmdsl.results.status import Cause, Status
 
 if TYPE_CHECKING:
-    import os
-
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from lmdsl.explanation.causes import Explanation
     from lmdsl.results.result import Result
-
-PAGE = 2e8
-"""Bytes for a page as pixels, and for matplotlib."""
-FORMATS = ("png", "pdf", "svg")
 
 
 @own_arithmetic
@@ -106,7 +95,7 @@ def portrait(
         image = runs.constant_map(given)(x[:, None], np.tile(list(u.values()), (len(x), 1)))[:, 0]
         first = np.array([[low + 0.1234 * (high - low)]])
         orbit = runs.open_loop(given, partition, first, u, steps or 60, fine=False)[:, 0, 0]
-        layers.graph(drawn, view, x, image, orbit)
+        overlays.graph(drawn, view, x, image, orbit)
         return drawn
     side = starts or (8 if lines else 14)
     grid = np.stack(np.meshgrid(*[np.arange(side)] * 2), axis=-1).reshape(-1, 2)
@@ -116,7 +105,7 @@ def portrait(
     span = (partition.high - partition.low)[shown_axes]
     first[:, shown_axes] = partition.low[shown_axes] + place * span
     points = runs.open_loop(given, partition, first, u, steps or (60 if lines else 300), fine=lines)
-    layers.orbits(drawn, view, points, place[:, 1], lines)
+    overlays.orbits(drawn, view, points, place[:, 1], lines)
     layers.outline(drawn, view, view.shadow(attractor), layers.ATTRACTOR, 1.6)
     return drawn
 
@@ -252,7 +241,7 @@ def control(
         grid = control_values(result.problem)[k]
         layers.levels(drawn, view, values, grid, f"control {plain(chosen, 24)}")
     elif (result.control_index < 0).all():
-        layers.remark(drawn, "no controller")
+        overlays.remark(drawn, "no controller")
     layers.regions(drawn, view, view.slice(_codes(result)), legend)
     return drawn
 
@@ -289,144 +278,9 @@ def measure(
         values = view.slice(_on_stabilized(result, result.measure))
         layers.scalar(drawn, view, values, "Lyapunov measure", "cividis")
     else:
-        layers.remark(drawn, "no Lyapunov measure")
+        overlays.remark(drawn, "no Lyapunov measure")
     layers.regions(drawn, view, view.slice(_codes(result)), legend)
     return drawn
-
-
-@own_arithmetic
-def trajectories(
-    result: Result,
-    ax: Axes | None = None,
-    starts: int | ArrayLike = 16,
-    seed: int = 0,
-    *,
-    steps: int = 500,
-    axes: Sequence[str] | None = None,
-    at: At | None = None,
-    legend: bool = False,
-) -> Axes:
-    """Draw closed-loop runs of the true map, from a ring to the attractor, a dot, or a loss, x.
-
-    Lines for a differential equation, dots joined by thin lines for a map, broken where a
-    periodic axis wraps; one dimension is drawn over the step number.
-
-    Parameters
-    ----------
-    result
-        A result; without a controller only the regions are drawn.
-    ax
-        Axes to draw into; new ones if None.
-    starts
-        Number of random starts, drawn by m, or states, shape (r, d).
-    seed
-        Seed of the starts and the noise.
-    steps
-        Step limit.
-    axes, at
-        Which axes are shown; regions other than the attractor are shown in up to two dimensions.
-    legend
-        Explain the regions below the axes.
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-    """
-    steps, seed = inputs.whole(steps, "steps"), inputs.seed(seed)
-    view = _view(result, axes, at)
-    drawn: Axes = layers.frame(ax, view, "closed loop")
-    status = result.cell_status
-    attractor = view.shadow(status == CellStatus.ATTRACTOR)
-    code = np.where(attractor, np.uint8(CellStatus.ATTRACTOR), np.uint8(CellStatus.STABILIZED))
-    if not view.hidden:
-        code = view.slice(_codes(result))
-    if (result.control_index < 0).all() or not result.weight.any():
-        layers.remark(drawn, "no controller")
-        layers.regions(drawn, view, code, legend)
-        return drawn
-    x = runs.starts_of(result, starts, seed)
-    points, last, pieces = runs.closed_loop(result, x, steps, seed)
-    reached = (last >= 0) & (status[last] == CellStatus.ATTRACTOR)
-    running = (last >= 0) & (status[last] == CellStatus.STABILIZED)
-    drawn.set_title(f"closed loop, {int(reached.sum())} of {len(x)} runs reach A", fontsize=11)
-    if len(view.axes) == 1:
-        drawn.set_xlabel("step")
-        drawn.locator_params(axis="x", integer=True)
-        drawn.set_ylabel(view.label(0))
-        drawn.set_xlim(-0.4, (len(points) - 1) / pieces + 0.4)
-        drawn.set_ylim(*view.ends(0))
-    layers.regions(drawn, view, code, legend, upright=False)
-    lines = runs.is_ode(result.problem)
-    layers.runs(drawn, view, points, reached, ~reached & ~running, lines, pieces)
-    return drawn
-
-
-@own_arithmetic
-def figure(
-    result: Result,
-    path: str | os.PathLike[str] | None = None,
-    *,
-    axes: Sequence[str] | None = None,
-    at: At | None = None,
-    seed: int = 0,
-) -> Figure:
-    """Draw one page with everything: portrait, cost, controls, measure, runs and the numbers.
-
-    Parameters
-    ----------
-    result
-        A result of any status.
-    path
-        File to write, ending in .png, .pdf or .svg; it appears whole or not at all.
-    axes, at
-        Which axes are shown and where the others are held.
-    seed
-        Seed of the closed-loop runs.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    BadInput
-        The ending is unknown, or the file cannot be written.
-    """
-    seed = inputs.seed(seed)
-    target = None if path is None else inputs.path(path)
-    kind = "" if target is None else target.suffix[1:].lower()
-    if target is not None and kind not in FORMATS:
-        raise BadInput(f"{shown(str(target), 200)}: a plot ends in .png, .pdf or .svg")
-    view = _view(result, axes, at)
-    draw: list[Any] = []
-    if len(view.axes) == 2 or not view.hidden:
-        draw.append(lambda ax: portrait(result, ax=ax, axes=axes, at=at))
-    draw.append(lambda ax: cost(result, ax, axes=axes, at=at))
-    if (result.control_index >= 0).any():
-        for name in result.problem.controls[:4]:
-            draw.append(lambda ax, name=name: control(result, name, ax, axes=axes, at=at))
-        draw.append(lambda ax: measure(result, ax, axes=axes, at=at))
-        draw.append(lambda ax: trajectories(result, ax, seed=seed, axes=axes, at=at))
-    draw.append(lambda ax: _numbers(ax, result))
-    memory.require(_bytes(view, 300 + 60 * len(draw)) + PAGE, "plots")
-    columns = min(len(draw), 3)
-    rows = -(-len(draw) // columns)
-    page: Figure = layers.blank(columns, rows)
-    for k, panel in enumerate(draw):
-        ax = page.add_subplot(rows, columns, k + 1)
-        try:
-            panel(ax)
-        except BadInput as error:  # such as a Python function that a directory does not hold
-            layers.remark(ax, textwrap.fill(plain(error.message, 200), 36))
-    page.suptitle(plain(result.problem.name, 100), fontsize=13)
-    if target is not None:
-        content = BytesIO()
-        stamp = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph .* missing from")
-            page.savefig(content, format=kind, dpi=200, metadata=stamp)
-        write_whole(target, content.getvalue())
-    return page
 
 
 def _result() -> type[Result]:
@@ -462,34 +316,3 @@ def _codes(result: Result) -> NDArray[np.uint8]:
         if result.cause == Cause.GAMMA:
             code[free & (result.witness > 0)] = layers.INFINITE
     return code
-
-
-def _numbers(ax: Any, result: Result) -> None:
-    """Write the status and the key numbers."""
-
-    def known(value: float | None, digits: int = 6) -> str:
-        return "unknown" if value is None else number(value, digits)
-
-    covered, cells = result.coverage, str(result.cells)
-    if covered is not None:
-        cells = f"{covered.stabilizable} of {covered.free} free stabilizable"
-    rows = [
-        ("status", result.status.replace("_", " ")),
-        ("backend", plain(result.backend or "none", 30)),
-        ("gamma", known(result.gamma)),
-        ("cost", known(result.cost)),
-        ("lower bound", known(result.lower_bound)),
-        ("gap", known(result.gap, 2)),
-        ("contraction", known(result.contraction)),
-        ("cells", cells),
-        ("attractor", f"{result.attractor_cells} cell{'s' if result.attractor_cells != 1 else ''}"),
-        ("controls", known(result.controls)),
-    ]
-    ax.set_axis_off()
-    for k, (name, value) in enumerate(rows):
-        y = 0.97 - 0.075 * k
-        ax.text(0.02, y, name, transform=ax.transAxes, va="top", color="#666666")
-        ax.text(0.38, y, value, transform=ax.transAxes, va="top", color=layers.INK)
-    message = textwrap.fill(plain(result.message, 300), 46)
-    y = 0.97 - 0.075 * (len(rows) + 0.5)
-    ax.text(0.02, y, message, transform=ax.transAxes, va="top", fontsize=9, color=layers.INK)

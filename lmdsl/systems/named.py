@@ -10,7 +10,7 @@ from pydantic import model_validator
 
 from lmdsl.common.strict_model import Positive
 from lmdsl.errors import BadInput, shown
-from lmdsl.formulas.language import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
+from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
 from lmdsl.systems.base import MapSystem, OdeSystem, Step, Substeps, System
 
 

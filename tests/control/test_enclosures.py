@@ -12,7 +12,8 @@ import pytest
 
 from lmdsl.formulas.enclosures import Jet, apply, enclosure
 from lmdsl.formulas.intervals import FUNCTION_ULPS, Interval, subtract
-from lmdsl.formulas.language import OPERATIONS, parse
+from lmdsl.formulas.language import parse
+from lmdsl.formulas.operations import OPERATIONS
 from lmdsl.formulas.program import Program
 
 UNARY = ["sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "log", "sqrt"]

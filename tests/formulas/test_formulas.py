@@ -10,12 +10,8 @@ from formula_texts import NAMES, UFUNCS, Oracle, formula_or_refusal, refused, sa
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lmdsl.formulas.language import (
-    FORMULA_CONSTANTS,
-    FORMULA_FUNCTIONS,
-    Formula,
-    parse,
-)
+from lmdsl.formulas.language import Formula, parse
+from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
 from lmdsl.formulas.program import Program
 
 

@@ -10,12 +10,9 @@ from formula_texts import NAMES, Oracle, same_bits, value
 from spent import at_most
 
 from lmdsl.errors import BadInput
-from lmdsl.formulas import language
-from lmdsl.formulas.language import (
-    FORMULA_FUNCTIONS,
-    Formula,
-    parse,
-)
+from lmdsl.formulas import operations
+from lmdsl.formulas.language import Formula, parse
+from lmdsl.formulas.operations import FORMULA_FUNCTIONS
 from lmdsl.formulas.program import Program
 
 # Programs.
@@ -28,14 +25,14 @@ def program(*texts, constants=None, names=(*NAMES, "K")):
 
 def counting(monkeypatch, name):
     shapes = []
-    original = language.OPERATIONS[name]
+    original = operations.OPERATIONS[name]
 
     def counted(*arguments, **keywords):
         result = original(*arguments, **keywords)
         shapes.append(np.shape(result))
         return result
 
-    monkeypatch.setitem(language.OPERATIONS, name, counted)
+    monkeypatch.setitem(operations.OPERATIONS, name, counted)
     return shapes
 
 
@@ -94,7 +91,7 @@ def test_memory_of_a_dead_temporary_is_used_again(monkeypatch):
         targets.append(out is not None)
         return original(*arguments, out=out)
 
-    monkeypatch.setitem(language.OPERATIONS, "+", watched)
+    monkeypatch.setitem(operations.OPERATIONS, "+", watched)
     x, y = np.ones((4, 1)), np.ones((1, 3))
     program("x + 1 + 2 + y + x")({"x": x, "y": y})
     # an input is never the target; then a temporary; then one too small; then one that fits

@@ -11,10 +11,11 @@ from models import dense, random_lp
 from problems import made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl.model import stabilizable_set
+from lmdsl.model import algorithm_1
+from lmdsl.model.algorithm_1 import tree
 from lmdsl.model.discretization import Nodes
 from lmdsl.model.rows import Shares
-from lmdsl.model.stabilizable_set import CellStatus, stabilizable, tree
+from lmdsl.model.stabilizable_set import CellStatus, stabilizable
 
 
 def test_A_b_c_by_hand():
@@ -173,7 +174,7 @@ def test_stabilizable_set_by_definition(seed):
 @pytest.mark.parametrize("patience", [0, 0.5, 8])
 def test_levels_by_sweeps_and_by_search_are_the_same(patience, monkeypatch):
     """By definition: one more than the least level entered, by the first pair that enters it."""
-    monkeypatch.setattr(stabilizable_set, "PATIENCE", patience)
+    monkeypatch.setattr(algorithm_1, "PATIENCE", patience)
     rng = np.random.default_rng(5)
     for _ in range(40):
         lp = random_lp(rng, 30, controls=5, absorb=0.05)

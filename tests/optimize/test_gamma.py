@@ -24,6 +24,7 @@ from lmdsl.model.grid.directions import Directions
 from lmdsl.model.rows import Rows, Shares
 from lmdsl.optimize.feasibility import (
     gamma_bar,
+    perron,
     slowest_growth,
     spectral_radius,
     stopping,
@@ -195,11 +196,11 @@ def test_the_rate_of_a_large_class_needs_no_factors(shift, monkeypatch):
     M = sp.csr_array((weight, (np.tile(np.arange(n), 4), target)), (n, n))
     M = sp.csr_array(M / (1.1 * M.sum(axis=1).max()))
     monkeypatch.setattr(classes, "solve_by_class", None)
-    x, rate, least = spectral_radius._perron(M, types.never, 0.0, Directions.line(n))
+    x, rate, least = perron._perron(M, types.never, 0.0, Directions.line(n))
     assert (x > 0).all()
     assert least <= rate <= least * (1 + 1e-9)
     assert rate == pytest.approx(abs(eigs(M, k=1, return_eigenvectors=False)[0]), rel=1e-9)
-    early = spectral_radius._perron(M, types.never, 2 * rate, Directions.line(n))
+    early = perron._perron(M, types.never, 2 * rate, Directions.line(n))
     assert rate < early[1] < 2 * rate
 
 

@@ -37,7 +37,7 @@ import pytest
 
 import lmdsl as lm
 from lmdsl import backends, cli, plotting
-from lmdsl.formulas.language import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
+from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
 from lmdsl.problem import problem
 from lmdsl.results import comparison
 from lmdsl.results.directory import archive

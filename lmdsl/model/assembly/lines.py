@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.types import Floats
-from lmdsl.formulas.language import PLAIN
+from lmdsl.formulas.operations import PLAIN
 from lmdsl.formulas.program import Instruction, Program
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.assembly.merging import add_cost, settle_cost

@@ -10,9 +10,9 @@ import numpy as np
 from lmdsl.common.types import Bools, Floats, Stop, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.feasibility.perron import FINE
 from lmdsl.optimize.feasibility.spectral_radius import (
     COARSE,
-    FINE,
     ROUNDS,
     SLIGHT,
     TIED,

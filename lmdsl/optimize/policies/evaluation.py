@@ -7,8 +7,8 @@ import numpy as np
 from lmdsl.certificate import bounds
 from lmdsl.common.types import Floats, Pairs, never
 from lmdsl.common.types import Stop as Stop
+from lmdsl.model.algorithm_1 import reaches_attractor
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.reachability import reaches_attractor
 from lmdsl.optimize.linear import equations
 from lmdsl.optimize.linear.policy_system import of_policy
 from lmdsl.optimize.linear.substitution import Peeled
