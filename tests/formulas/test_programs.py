@@ -15,7 +15,6 @@ from lmdsl.formulas.language import Formula, parse
 from lmdsl.formulas.operations import FORMULA_FUNCTIONS
 from lmdsl.formulas.program import Program
 
-# Programs.
 STANDARD_MAP = ("x + y + K*u*sin(2*pi*x)", "y + K*u*sin(2*pi*x)")
 
 

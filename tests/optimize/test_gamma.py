@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import re
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from corners import corner
+from brackets import check_vectors, integrator
 from models import brute_force, build, dense, mdp, random_lp
 from problems import doubling, made, standard_map, steps
 from scipy.sparse.linalg import eigs
 
 import lmdsl as lm
-from lmdsl.certificate.bounds import exactly_below
-from lmdsl.cli import main
 from lmdsl.common import types
 from lmdsl.model.discretization import Nodes
 from lmdsl.model.grid.directions import Directions
@@ -25,9 +21,6 @@ from lmdsl.model.rows import Rows, Shares
 from lmdsl.optimize.feasibility import (
     gamma_bar,
     perron,
-    slowest_growth,
-    spectral_radius,
-    stopping,
 )
 from lmdsl.optimize.feasibility.infeasible import check_high
 from lmdsl.optimize.feasibility.spectral_radius import check_low
@@ -80,7 +73,7 @@ def test_reducible_structures_close_the_bracket(stays, true):
     assert found.high >= true * (1 - 1e-15)
     assert found.high <= found.low * (1 + 1e-6)
     assert found.note == ""
-    _check_vectors(lp, found)
+    check_vectors(lp, found)
 
 
 def loops(n: int, stay: int = 9, samples: int = 10) -> lm.StabilizationLP:
@@ -103,7 +96,7 @@ def test_equal_slow_classes_in_series(n):
     assert lp.control[found.policy].tolist() == [0] * n
     assert len(found.limiting) == len(found.beyond) == n
     assert n < 40 or found.w_low.max() > 1e200 * found.w_low.min()
-    _check_vectors(lp, found)
+    check_vectors(lp, found)
 
 
 @pytest.mark.parametrize(("n", "up", "down"), [(100, 5, 90), (150, 1, 20), (60, 40, 59)])
@@ -121,7 +114,7 @@ def test_one_class_whose_vectors_fall_over_many_decades(n, up, down):
     scale = (up / down) ** (np.arange(n) / 2)  # makes all but the last row symmetric
     rho = np.linalg.eigvals(scale[:, None] * P / scale).real.max()
     assert found.low * (1 - 1e-9) <= 1 / rho <= found.high * (1 + 1e-9)
-    _check_vectors(lp, found)
+    check_vectors(lp, found)
 
 
 def test_a_bracket_that_doubles_cannot_close_says_so():
@@ -130,7 +123,7 @@ def test_a_bracket_that_doubles_cannot_close_says_so():
     assert 1e-6 < found.high / found.low - 1 < 1e-2
     assert "leave the range of doubles" in found.note
     assert found.note in found.text()
-    _check_vectors(loops(300, 90, 100), found)
+    check_vectors(loops(300, 90, 100), found)
 
 
 @pytest.mark.parametrize("g", [1.11, 1.1111, 100 / 90, 1.2])
@@ -152,22 +145,6 @@ def test_ended_early():
     assert found.limiting is found.beyond is None
 
 
-def _check_vectors(lp, found):
-    """Both ends in exact arithmetic, and that the cells named are those of the vectors."""
-    at = replace(lp, gamma=found.high)
-    assert all(exactly_below(at, k, found.w_high, found.high, None) for k in range(lp.K))
-    assert (found.w_high >= 0).all()
-    assert found.w_high.any()
-    np.testing.assert_array_equal(found.beyond.cells, lp.cells[found.w_high > 0])
-    assert set(found.limiting.cells) <= set(found.beyond.cells)
-    assert len(found.limiting) > 0
-    w = [Fraction(float(x)) for x in found.w_low]
-    for i, k in enumerate(found.policy):
-        row = lp.rows.exact(int(k))
-        ahead = sum(w[j] * s for j, s in row if j < lp.n) / lp.rows.shares.total
-        assert Fraction(found.low) * ahead <= w[i]
-
-
 @pytest.mark.parametrize("width", [1e-8, 1e-2, 0.5])
 def test_the_width_asked_for(width):
     for made_lp in (chain([9, 5]), lm.compile(made(standard_map(20)))):
@@ -177,7 +154,7 @@ def test_the_width_asked_for(width):
         exact = gamma_bar.bracket(made_lp)
         assert found.low <= exact.high
         assert found.high >= exact.low
-        _check_vectors(made_lp, found)
+        check_vectors(made_lp, found)
 
 
 @pytest.mark.parametrize("width", [0, -1.0, 1e-9, 2, np.nan, "1", True, None])
@@ -202,70 +179,6 @@ def test_the_rate_of_a_large_class_needs_no_factors(shift, monkeypatch):
     assert rate == pytest.approx(abs(eigs(M, k=1, return_eigenvectors=False)[0]), rel=1e-9)
     early = perron._perron(M, types.never, 2 * rate, Directions.line(n))
     assert rate < early[1] < 2 * rate
-
-
-@pytest.mark.parametrize(("cells", "g"), [(30, 2.2), (50, 2.4), (50, 2.5001), (50, 5), (50, 1e6)])
-def test_gamma_near_and_far_beyond_its_limit(cells, g):
-    result = lm.solve(made(standard_map(cells, gamma=g)))
-    limits = gamma_bar.bracket(lm.compile(made(standard_map(cells))))
-    assert not limits.low <= g <= limits.high
-    expected = "verified" if g < limits.low else "not_stabilizable"
-    assert result.status == expected, result.message
-
-
-def integrator(cells: int, gamma_value: float = 1.0) -> dict:
-    """A double integrator at a short step: transport over many cells, vectors over many decades."""
-    return {
-        "system": {"kind": "double_integrator", "parameters": {"h": 2.4 / cells}},
-        "state_box": {
-            "x": {"low": -2, "high": 2, "cells": cells},
-            "v": {"low": -1.5, "high": 1.5, "cells": cells * 3 // 4},
-        },
-        "attractor": {"points": [{"x": 0, "v": 0}]},
-        "control_grid": {"u": {"low": -1, "high": 1, "points": 5}},
-        "stage_cost": "1",
-        "sampling": {"kind": "grid", "per_axis": 4},
-        "on_exit": "clip",
-        "gamma": gamma_value,
-    }
-
-
-def test_long_ways_take_few_policies(monkeypatch):
-    """Howard's iteration on the vectors of the classes, not hundreds of stopping policies."""
-    lp, calls = lm.compile(made(integrator(60))), []
-    for module, name in ((spectral_radius, "of_policy"), (stopping, "_stopped")):
-        inner = getattr(module, name)
-
-        def counted(*args, inner=inner):
-            calls.append(inner)
-            return inner(*args)
-
-        monkeypatch.setattr(module, name, counted)
-    found = gamma_bar.bracket(lp)
-    assert found.high <= found.low * (1 + 1e-6)
-    assert len(calls) < 90
-    calls.clear()
-    below = lm.solve(replace(lp, gamma=found.low * (1 - 1e-4)))
-    assert below.status == "verified", below.message
-    for far in (found.high * (1 + 1e-4), 5.0):
-        above = lm.solve(replace(lp, gamma=far))
-        assert above.status == "not_stabilizable", above.message
-        assert above.gamma_bar[1] <= above.gamma_bar[0] * (1 + 1e-6)
-    assert len(calls) < 300
-    _check_vectors(lp, found)
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_improving_a_policy_never_lowers_its_limit(seed):
-    lp = random_lp(np.random.default_rng(seed), cells=8, controls=4, absorb=0.3)
-    if not lp.n:
-        return
-    first = spectral_radius.of_policy(lp, lp.tree[1])
-    better = slowest_growth.improved(lp, first)
-    assert better.limit >= first.limit * (1 - 1e-12)
-    proved = spectral_radius.prove_low(lp, better)
-    assert proved is not None
-    assert proved[0] <= better.limit * (1 + 1e-12)
 
 
 def test_ended_anywhere_it_keeps_what_is_proved():
@@ -310,7 +223,7 @@ def test_against_all_policies(seed):
     assert found.low <= (1 + 1e-9) / rho
     assert found.high >= (1 - 1e-9) / rho
     assert found.high <= found.low * (1 + 1e-6)
-    _check_vectors(lp, found)
+    check_vectors(lp, found)
 
 
 def test_spoiled_vectors_are_refused():
@@ -325,117 +238,3 @@ def test_spoiled_vectors_are_refused():
     w = found.w_high.copy()
     w[int(np.argmax(w))] *= 2
     assert check_high(lp, w) > found.high * 1.5
-
-
-def test_solve_just_below_and_above():
-    found = lm.gamma_max(made(standard_map(10)))
-    below = lm.solve(made(standard_map(10, gamma=found.low * (1 - 1e-2))))
-    assert below.status == "verified", below.message
-    above = lm.solve(made(standard_map(10, gamma=found.high * (1 + 1e-4))))
-    assert above.status == "not_stabilizable"
-    low, high = above.gamma_bar
-    assert low == pytest.approx(found.low, rel=1e-6)
-    assert high == pytest.approx(found.high, rel=1e-6)
-
-
-def test_command_line(tmp_path, capsys):
-    file = tmp_path / "p.json"
-    file.write_text(json.dumps(steps()))
-    assert main(["gamma-max", str(file), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == {
-        "gamma_bar": ["inf", "inf"], "stabilizable_cells": 3, "limiting": None, "beyond": None,
-        "note": "",
-    }  # fmt: skip
-    file.write_text(json.dumps(doubling()))
-    assert main(["gamma-max", str(file)]) == 0
-    assert "gamma_bar lies in" in capsys.readouterr().out
-    file.write_text(json.dumps(steps(avoid={"boxes": [{"x": [0.25, 0.5]}]})))
-    assert main(["gamma-max", str(file), "--json"]) == 3
-    assert json.loads(capsys.readouterr().out) == {
-        "gamma_bar": None, "stabilizable_cells": 0, "limiting": None, "beyond": None,
-        "note": "no cell is stabilizable",
-    }  # fmt: skip
-    assert main(["gamma-max", str(file)]) == 3
-    assert capsys.readouterr().out == "no cell is stabilizable, so there is no gamma_bar\n"
-
-
-def test_no_cell_is_not_a_bad_input():
-    found = lm.gamma_max(made(steps(avoid={"boxes": [{"x": [0.25, 0.5]}]})))
-    assert found.low == found.high == found.stabilizable == 0
-    assert len(found.policy) == 0
-    assert found.to_dict()["gamma_bar"] is None
-
-
-def test_one_hard_corner_can_be_left_out(tmp_path):
-    problem = made(corner(2.5))
-    assert lm.solve(problem).status == "not_stabilizable"
-    result = lm.solve(problem, restrict_to_gamma=True)
-    assert result.status == "verified", result.message
-    assert result.cell_status.tolist() == [0, 1, 1, 6, 1, 6]
-    g = 2.5
-    np.testing.assert_allclose(result.value[[1, 2, 4]], [1, 1 + g, 2 + g * (1 + g)])
-    assert result.control_index.tolist()[4] == 1
-    assert np.isinf(result.value[[3, 5]]).all()
-    assert (result.witness[[3, 5]] > 0).all()
-    result.save(tmp_path / "out")
-    assert lm.verify(tmp_path / "out").holds
-    assert lm.verify(tmp_path / "out", exact=True).holds
-    # Negative control: a cell wrongly left out is not proved infeasible.
-    with np.load(tmp_path / "out" / "solution.npz") as stored:
-        arrays = dict(stored)
-    arrays["cell_status"][4] = 6
-    np.savez(tmp_path / "out" / "solution.npz", **arrays)
-    assert not lm.verify(tmp_path / "out").holds
-    feasible = lm.solve(made(corner(1.5)), restrict_to_gamma=True)
-    assert feasible.cell_status.tolist() == [0, 1, 1, 1, 1, 1]
-
-
-CORNER_TEXT = """gamma_bar lies in [1.99999999..., 2.0000000...]
-  limited by 1 of 5 stabilizable cells: 1 in x in [3, 4]
-  with those that cannot avoid them 2 cells: 1 in x in [3, 4]; 1 in x in [5, 6]
-  this corner limits gamma_bar for all; --restrict-to-gamma (restrict_to_gamma=True) solves on the \
-cells for which gamma is feasible"""
-
-
-def test_the_hard_corner_is_named(tmp_path, capsys):
-    found = lm.gamma_max(made(corner(1.0)))
-    assert re.fullmatch(re.escape(CORNER_TEXT).replace(r"\.\.\.", r"\d*"), found.text())
-    assert found.limiting.cells.tolist() == [3]
-    assert found.beyond.cells.tolist() == [3, 5]
-    assert found.corner
-    file = tmp_path / "corner.json"
-    file.write_text(json.dumps(corner(1.0)))
-    assert main(["gamma-max", str(file), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
-    box = {"cells": 1, "regions": [{"box": {"x": [3.0, 4.0]}, "cells": 1}], "elsewhere": 0}
-    assert data["limiting"] == box
-    assert data["beyond"]["cells"] == 2
-    assert main(["solve", str(file), "--gamma", "2.5", "--out", str(tmp_path / "out")]) == 3
-    said = capsys.readouterr().out
-    assert "gamma = 2.5 is not below gamma_bar, which lies in [2, 2]" in said
-    assert (
-        "no control makes the cost finite from 2 cells (1 in x in [3, 4]; 1 in x in [5, 6]); "
-        "gamma_bar is limited by 1 cell (1 in x in [3, 4]); this corner limits gamma_bar for all; "
-        "lower gamma, or solve on the other 3 cells with --restrict-to-gamma"
-    ) in said
-    loaded = lm.Result.load(tmp_path / "out")
-    assert loaded.beyond_gamma.cells.tolist() == [3, 5]
-    assert loaded.to_dict()["beyond_gamma"] == data["beyond"]
-    stored = json.loads((tmp_path / "out" / "certificate.json").read_text())
-    assert stored["beyond_gamma"] == data["beyond"]
-    kept = lm.solve(made(corner(2.5)), restrict_to_gamma=True)
-    assert kept.to_dict()["beyond_gamma"] == data["beyond"]
-    assert lm.solve(made(corner(1.5))).to_dict()["beyond_gamma"] is None
-
-
-def test_all_cells_are_no_corner():
-    found = lm.gamma_max(made(doubling()))
-    assert not found.corner
-    assert "corner" not in found.text()
-    refused = lm.solve(made(doubling(3)))
-    assert "corner" not in refused.message
-    assert refused.message.endswith("; lower gamma")
-
-
-def test_restriction_leaves_nothing():
-    assert lm.solve(made(doubling(3)), restrict_to_gamma=True).status == "not_stabilizable"
