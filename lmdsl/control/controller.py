@@ -55,8 +55,7 @@ class Controller(Frozen):
             a local controller, on the attractor cells.
         """
         states = inputs.states(x, self.partition.names)
-        flat = self.partition.states(states.reshape(-1, self.partition.dimension))
-        cell = self.partition.locate(list(flat.T))
+        flat, cell = self.partition.enter(states.reshape(-1, self.partition.dimension))
         return self.at(cell, flat).reshape(*states.shape[:-1], self.vectors.shape[1])
 
     def at(self, cell: Indices, x: Floats | None = None) -> Floats:

@@ -22,6 +22,7 @@ from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.discretization import noise_nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local_controller import LocalController
+from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 
 SAMPLES, FEWEST = 10_000, 10
@@ -99,11 +100,12 @@ def check(
     """
     cells = np.flatnonzero(local.attractor)
     asked, nodes = Deadline.of(deadline), noise_nodes(problem).values
+    true_map = TrueMap(problem, local.partition)
     if samples is None:
-        work = getattr(problem.step(), "work", FUNCTION) * len(nodes)
-        samples = int(min(SAMPLES, max(SAMPLED_WORK // work, FEWEST)))
-    proved = _proved(problem, local, cells, nodes, asked)
-    samples, kept = _sampled(problem, local, cells, nodes, samples, asked)
+        work = FUNCTION if true_map.map.enclose is None else true_map.map.work
+        samples = int(min(SAMPLES, max(SAMPLED_WORK // (work * len(nodes)), FEWEST)))
+    proved = _proved(true_map, local, cells, nodes, asked)
+    samples, kept = _sampled(true_map, local, cells, nodes, samples, asked)
     return LocalCheck(
         kind="constant" if problem.local_controller is None else problem.local_controller.kind,
         multiplier=local.multiplier,
@@ -115,7 +117,7 @@ def check(
 
 
 def _sampled(
-    problem: Problem,
+    true_map: TrueMap,
     local: LocalController,
     cells: Indices,
     nodes: Floats,
@@ -132,14 +134,14 @@ def _sampled(
     for start in range(0, count, part):
         some = slice(start, min(start + part, count))
         try:
-            kept += int(_stays(problem, local, x[some], cell[some], nodes, deadline).sum())
+            kept += int(_stays(true_map, local, x[some], cell[some], nodes, deadline).sum())
         except TimeLimitReached:
             return start, kept
     return count, kept
 
 
 def _stays(
-    problem: Problem,
+    true_map: TrueMap,
     local: LocalController,
     x: Floats,
     cell: Indices,
@@ -148,36 +150,33 @@ def _stays(
 ) -> NDArray[np.bool_]:
     """Return which states of attractor cells are mapped into A by every noise node."""
     u = local(x, cell)
-    values = {name: x[:, k, None] for k, name in enumerate(problem.states)}
-    values |= {name: u[:, k, None] for k, name in enumerate(problem.controls)}
-    step, stays = problem.step(), np.ones(len(x), dtype=np.bool_)
+    states, controls = list(x.T[:, :, None]), list(u.T[:, :, None])
+    stays = np.ones(len(x), dtype=np.bool_)
     width = max(1, CHUNK // max(len(x), 1))
     for start in range(0, len(nodes), width):
         some = nodes[start : start + width]
-        noise = {name: some[None, :, j] for j, name in enumerate(problem.noises)}
-        shape = len(x), len(some)
-        images = step({**values, **noise}, partial(deadline.check, DOING))
+        shape, noise = (len(x), len(some)), list(some.T[:, None, :])
+        images = true_map(states, controls, noise, partial(deadline.check, DOING))
         target = local.partition.locate([np.broadcast_to(y, shape) for y in images])
         stays &= ((target >= 0) & local.attractor[target]).all(axis=1)
     return stays
 
 
 def _proved(
-    problem: Problem, local: LocalController, cells: Indices, nodes: Floats, deadline: Deadline
+    true_map: TrueMap, local: LocalController, cells: Indices, nodes: Floats, deadline: Deadline
 ) -> int | None:
     """Count the cells that are mapped into A as a whole; None where no formula allows it.
 
     Cells that are still undecided when the work is used up count as not proved.
     """
-    step = problem.step()
-    if not hasattr(step, "enclose"):
+    if true_map.map.enclose is None:
         return None
-    per_box = float(step.effort) * len(nodes) * (1 + local.partition.dimension)
+    per_box = float(true_map.map.effort) * len(nodes) * (1 + local.partition.dimension)
     proved, work = 0, WORK
     for start in range(0, len(cells), CHUNK):
         some = cells[start : start + CHUNK]
         try:
-            kept, spent = _kept(problem, local, some, nodes, work / per_box, deadline)
+            kept, spent = _kept(true_map, local, some, nodes, work / per_box, deadline)
         except TimeLimitReached:
             break
         proved += kept
@@ -188,7 +187,7 @@ def _proved(
 
 
 def _kept(
-    problem: Problem,
+    true_map: TrueMap,
     local: LocalController,
     cells: Indices,
     nodes: Floats,
@@ -200,7 +199,7 @@ def _kept(
     A box whose image is not enclosed in A is halved along its longest side (in cell widths),
     unless its centre is mapped outside: then its cell is lost.
     """
-    step, partition, check = problem.step(), local.partition, partial(deadline.check, DOING)
+    partition, check = local.partition, partial(deadline.check, DOING)
     (low, high, home), work = partition.domain(cells), 0.0
     lost = np.zeros(len(cells), dtype=np.bool_)
     for _ in range(ROUNDS * partition.dimension):
@@ -211,10 +210,10 @@ def _kept(
         with np.errstate(all="ignore"):
             for node in nodes:
                 check()
-                images = _images(problem, local, step, cells[home], low, high, node, check)
+                images = _images(true_map, local, cells[home], low, high, node, check)
                 inside &= _into(partition, local.attractor, images)
         centre = low / 2 + high / 2
-        lost[home[~_stays(problem, local, centre, cells[home], nodes, deadline)]] = True
+        lost[home[~_stays(true_map, local, centre, cells[home], nodes, deadline)]] = True
         open_ = ~inside & ~lost[home]
         low, high, home = low[open_], high[open_], home[open_]
         axis = np.argmax((high - low) / partition.width, axis=1)
@@ -228,9 +227,8 @@ def _kept(
 
 
 def _images(
-    problem: Problem,
+    true_map: TrueMap,
     local: LocalController,
-    step: Any,
     cell: Indices,
     low: Floats,
     high: Floats,
@@ -241,15 +239,14 @@ def _images(
     centre = Interval.point(low / 2 + high / 2)
     away = subtract(Interval(low, high), centre)
     steps = [Interval(*(end[:, k] for end in away)) for k in range(local.partition.dimension)]
-    images = _closed(problem, local, step, cell, Interval(low, high), noise, check)
-    middle = _closed(problem, local, step, cell, centre, noise, check)
+    images = _closed(true_map, local, cell, Interval(low, high), noise, check)
+    middle = _closed(true_map, local, cell, centre, noise, check)
     return [enclosure(image, at, steps) for image, at in zip(images, middle, strict=True)]
 
 
 def _closed(
-    problem: Problem,
+    true_map: TrueMap,
     local: LocalController,
-    step: Any,
     cell: Indices,
     box: Interval,
     noise: Floats,
@@ -262,11 +259,9 @@ def _closed(
     def on_jets(operation: str, *operands: Any) -> Any:
         return apply(operation, [y if isinstance(y, Jet) else Jet.constant(y, d) for y in operands])
 
-    u = local.law(x, cell, on_jets)
-    values = dict(zip((*problem.states, *problem.controls), (*x, *u), strict=True))
-    for j, name in enumerate(problem.noises):
-        values[name] = Jet.constant(noise[j], d)
-    images: tuple[Jet, ...] = step.enclose(values, check)
+    u, w = local.law(x, cell, on_jets), [Jet.constant(value, d) for value in noise]
+    images = true_map.enclose(x, u, w, check)
+    assert images is not None
     return images
 
 

@@ -20,6 +20,7 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.discretization import noise_nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.local_control import ConstantControl
 from lmdsl.problem.problem import Problem
 
@@ -148,7 +149,7 @@ class ClosedLoop:
     def __init__(self, problem: Problem, controller: Controller, status: NDArray[np.uint8]) -> None:
         self.problem, self.controller, self.status = problem, controller, status
         self.partition = controller.partition
-        self.map = problem.step()
+        self.true_map = TrueMap(problem, self.partition)
         self.nodes = noise_nodes(problem)
         self.probability = self.nodes.weights / self.nodes.weights.sum()
 
@@ -163,20 +164,11 @@ class ClosedLoop:
             The deadline has passed.
         """
         u = self.controller.at(cell, x)
-        values = {name: x[:, k] for k, name in enumerate(self.problem.states)}
-        values |= {name: u[:, k] for k, name in enumerate(self.problem.controls)}
+        noise: list[Floats] = []
         if self.problem.noises:
             node = rng.choice(len(self.probability), size=len(x), p=self.probability)
-            noise = self.nodes.values[node]
-            values |= {name: noise[:, k] for k, name in enumerate(self.problem.noises)}
-        check = partial(late.check, "simulating")
-        images = [np.broadcast_to(image, len(x)) for image in self.map(values, check)]
-        return self.enter(np.stack(images, axis=-1))
-
-    def enter(self, x: Floats) -> tuple[Floats, Indices]:
-        """Return the states that images or starts become, and their cells."""
-        states = self.partition.states(x)
-        return states, self.partition.locate(list(states.T))
+            noise = list(self.nodes.values[node].T)
+        return self.true_map.step(x, u, noise, partial(late.check, "simulating"))
 
     def run(
         self, x: Floats, steps: int, rng: np.random.Generator, late: Deadline = FOREVER
@@ -190,7 +182,7 @@ class ClosedLoop:
         arrived
             The states in which the runs that reached A entered it, in no particular order.
         """
-        x, cell = self.enter(x)
+        x, cell = self.partition.enter(x)
         arrived = [x[:0]]
         outcome = np.full(len(x), CYCLING, dtype=np.int64)
         taken = np.full(len(x), steps, dtype=np.int64)
@@ -223,7 +215,7 @@ class ClosedLoop:
         local = self.controller.local
         if local is None:
             raise BadInput("the problem names no local controller", "local_controller")
-        (x, cell), runs = self.enter(x), len(x)
+        (x, cell), runs = self.partition.enter(x), len(x)
         stayed = np.ones(runs, dtype=np.bool_)
         for n in range(steps):
             try:
@@ -259,7 +251,7 @@ class ClosedLoop:
         if start.size != self.partition.dimension or not np.isfinite(start).all():
             raise BadInput("a path starts in one state of finite numbers", "x")
         rng = np.random.default_rng(inputs.seed(seed))
-        state, cell = self.enter(start.reshape(1, -1))
+        state, cell = self.partition.enter(start.reshape(1, -1))
         states = [state[0]]
         while len(states) <= steps and cell[0] >= 0 and self.status[cell[0]] == 1:
             state, cell = self.step(state, cell, rng)
@@ -302,8 +294,8 @@ def simulate(
         When to stop: the runs that have not ended by then count as cycling.
     """
     # States, images and their cells, controls, noise, and the arrays of the formulas.
-    wide = loop.partition.dimension + len(loop.problem.controls) + len(loop.problem.noises)
-    memory.require(8 * starts * (16 * wide + 12 + getattr(loop.map, "live", 16)), "runs")
+    wide, live = len(loop.true_map.names), loop.true_map.map.live
+    memory.require(8 * starts * (16 * wide + 12 + live), "runs")
     rng = np.random.default_rng(seed)
     if not len(cells) or not weight.any():
         raise BadInput("there is no stabilizable cell to start from")

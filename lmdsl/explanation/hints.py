@@ -98,6 +98,7 @@ class _Trial:
         self.sampler, self.status, self.partition = sampler, status, sampler.partition
         self.points = _some(sampler.points, MOST_POINTS)
         self.nodes = _some(sampler.nodes.values, MOST_NODES)
+        self.noise = list(np.ascontiguousarray(self.nodes.T)[:, None, None, None, :])
         self.controls = _some(sampler.controls, MOST_CONTROLS)
         each = len(self.points) * len(self.nodes) * len(self.controls)
         self.most_cells = max(1, min(MOST_CELLS, CHUNK // each))
@@ -108,30 +109,20 @@ class _Trial:
         """Return the states of sample points, per axis (cells, 1, points, 1)."""
         return [x[:, None, :, None] for x in self.partition.samples(cells, self.points)]
 
-    def held(self, controls: list[Floats]) -> dict[str, Floats]:
-        """Return named controls and noise, ready to broadcast."""
-        problem = self.sampler.problem
-        named = dict(zip(problem.controls, controls, strict=True))
-        for k, name in enumerate(problem.noises):
-            named[name] = np.ascontiguousarray(self.nodes[:, k])[None, None, None, :]
-        return named
-
     def vectors(self) -> list[Floats]:
         """Return the controls tried, per variable (1, controls, 1, 1)."""
         return [np.ascontiguousarray(u)[None, :, None, None] for u in self.controls.T]
 
     def step(
-        self, state: list[Floats], held: dict[str, Floats], shape: tuple[int, ...]
+        self, state: list[Floats], controls: list[Floats], shape: tuple[int, ...]
     ) -> tuple[list[Floats], Floats, NDArray[np.int64]]:
         """Return images per axis, overshoot (2 d, *shape) by side, and status (-1 outside)."""
         p = self.partition
-        named = {**dict(zip(self.sampler.problem.states, state, strict=True)), **held}
+        named = self.sampler.true_map.named(state, controls, self.noise)
         images, over = [], np.zeros((2 * p.dimension, *shape))
-        for k, given in enumerate(self.sampler.step(named)):
-            x = np.broadcast_to(given.reshape((1,) * (4 - given.ndim) + given.shape), shape)
-            if p.periodic[k] or p.clip:
-                x = p.axes[k].state(x, p.clip)
-            else:
+        for k, (axis, image) in enumerate(zip(p.axes, self.sampler.step(named), strict=True)):
+            x = axis.state(np.broadcast_to(image, shape), p.clip)
+            if not (axis.periodic or p.clip):
                 low, high = float(p.low[k]), float(p.high[k])
                 beyond = EDGE * float(p.width[k])
                 for side, by in ((2 * k, low - x), (2 * k + 1, x - high)):
@@ -152,7 +143,7 @@ class _Trial:
 
 def _by_runs(trial: _Trial, cells: Cells) -> list[Hint]:
     shape = (len(cells), len(trial.controls), len(trial.points), len(trial.nodes))
-    held = trial.held(trial.vectors())
+    held = trial.vectors()
     state: list[Floats] = [np.broadcast_to(x, shape) for x in trial.start(cells)]
     arrived, live = np.zeros(shape, dtype=np.bool_), np.ones(shape, dtype=np.bool_)
     most = np.zeros((2 * trial.partition.dimension, *shape))
@@ -233,7 +224,7 @@ def _worst(trial: _Trial, cells: Cells, controls: list[Floats]) -> Floats:
     """
     width = max((u.shape[1] for u in controls), default=1)
     shape = (len(cells), width, len(trial.points), len(trial.nodes))
-    _, over, code = trial.step(trial.start(cells), trial.held(controls), shape)
+    _, over, code = trial.step(trial.start(cells), controls, shape)
     worst: Floats = (over / np.repeat(trial.span, 2).reshape(-1, 1, 1, 1, 1)).max(axis=0)
     np.copyto(worst, np.inf, where=code == CellStatus.AVOID)
     return np.asarray(worst.max(axis=(2, 3)))

@@ -178,10 +178,7 @@ def _move(sampler: Sampler, status: NDArray[np.uint8], cell: int, control: int) 
     shape = (1, len(sampler.points), len(nodes.weights), 1)
     values = sampler.values(Block(0, np.array([cell]), (control, control + 1)))
     point, node = divmod(s, len(nodes.weights))
-    image = [
-        float(np.broadcast_to(x.reshape((1,) * (4 - x.ndim) + x.shape), shape)[0, point, node, 0])
-        for x in sampler.step(values)
-    ]
+    image = [float(np.broadcast_to(x, shape)[0, point, node, 0]) for x in sampler.step(values)]
     problem = sampler.problem
     found: dict[str, Any] = {
         "control": dict(zip(problem.controls, map(float, sampler.controls[control]), strict=True)),

@@ -80,6 +80,11 @@ class Nodes:
         first = np.unique(self.group, return_index=True)[1]
         return [float(self.weights[i]) for i in first]
 
+    def mean(self) -> Floats:
+        """Return the mean of every noise variable, shape (r,)."""
+        mean: Floats = self.weights @ self.values / self.weights.sum()
+        return mean
+
     def exact_total(self) -> Fraction:
         """Return the exact sum of the weights."""
         return sum((Fraction(float(w)) for w in self.weights), Fraction(0))

@@ -24,8 +24,9 @@ from lmdsl.formulas.enclosures import Jet
 from lmdsl.formulas.intervals import Interval
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model import riccati
-from lmdsl.model.discretization import Nodes, control_range, noise_nodes
+from lmdsl.model.discretization import control_range, noise_nodes
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
 from lmdsl.problem.problem import Problem
 
@@ -111,12 +112,13 @@ class LocalController(Frozen):
             control[:, j] = declared.control.get(name, 0.0)
         _within(control, low, high, problem.controls, where)
         _inside(orbit, partition, attractor)
-        mean = _mean_noise(noise_nodes(problem))
+        true_map = TrueMap(problem, partition)
+        noise = [np.full(q, mean) for mean in noise_nodes(problem).mean()]
         check = partial(Deadline.of(deadline).check, "linearising along the orbit")
-        _refuse_unless_orbit(problem, partition, orbit, control, mean, check)
+        _refuse_unless_orbit(true_map, orbit, control, noise, check)
         width, reach = partition.width, _reach(low, high, control)
         unit = np.concatenate([width, reach])
-        jacobian = _jacobian(problem, orbit, control, mean, unit, check)
+        jacobian = _jacobian(true_map, orbit, control, noise, unit, check)
         A, B = jacobian[:, :, :d], jacobian[:, :, d:]
         smooth = bool(np.isfinite(jacobian).all())
         if isinstance(declared, LinearFeedback):
@@ -145,17 +147,10 @@ class LocalController(Frozen):
         for start in range(0, len(cell), PART):
             some = slice(start, start + PART)
             centres = self.partition.centres(cell[some])
-            away = self.deviation(centres[:, None, :], self.orbit[None, :, :])
+            away = self.partition.deviation(centres[:, None, :], self.orbit[None, :, :])
             far: Any = sum((away[..., i] / h) ** 2 for i, h in enumerate(self.partition.width))
             nearest[some] = np.argmin(far, axis=-1)
         return nearest
-
-    def deviation(self, x: Floats, point: Floats) -> Floats:
-        """Return x - point, on periodic axes the shortest way round."""
-        away = x - point
-        span = self.partition.high - self.partition.low
-        turns = np.where(self.partition.periodic, np.round(away / span), 0.0)
-        return np.asarray(away - turns * span)
 
     def __call__(self, x: Floats, cell: Indices) -> Floats:
         """Return the control at states x, shape (r, d), of given attractor cells, shape (r, p)."""
@@ -173,7 +168,7 @@ class LocalController(Frozen):
         k = self.owner(cell)
         # By way of the cell's centre: on a circle the law then has no jump inside a cell.
         centre = self.partition.centres(cell)
-        origin = self.deviation(centre, self.orbit[k])
+        origin = self.partition.deviation(centre, self.orbit[k])
         away = []
         for i, axis in enumerate(self.partition.axes):
             by = x[i] - centre[:, i]
@@ -196,7 +191,7 @@ class LocalController(Frozen):
         distance = np.empty(len(x))
         for start in range(0, len(x), PART):
             some = slice(start, start + PART)
-            away = self.deviation(x[some, None, :], self.orbit[None, :, :])
+            away = self.partition.deviation(x[some, None, :], self.orbit[None, :, :])
             distance[some] = np.abs(away / self.partition.width).max(axis=-1).min(axis=-1)
         return distance
 
@@ -220,30 +215,14 @@ def _inside(orbit: Floats, partition: Partition, attractor: NDArray[np.bool_]) -
             raise BadInput("the point lies in no attractor cell; add it to the attractor", where)
 
 
-def _mean_noise(nodes: Nodes) -> Floats:
-    mean: Floats = nodes.weights @ nodes.values / nodes.weights.sum()
-    return mean
-
-
 def _refuse_unless_orbit(
-    problem: Problem,
-    partition: Partition,
-    orbit: Floats,
-    control: Floats,
-    noise: Floats,
-    check: Check,
+    true_map: TrueMap, orbit: Floats, control: Floats, noise: list[Floats], check: Check
 ) -> None:
-    q = len(orbit)
-    values = {name: orbit[:, k] for k, name in enumerate(problem.states)}
-    values |= {name: control[:, j] for j, name in enumerate(problem.controls)}
-    values |= {name: np.full(q, noise[j]) for j, name in enumerate(problem.noises)}
-    images = np.stack([np.broadcast_to(y, q) for y in problem.step()(values, check)], axis=-1)
-    miss = images - np.roll(orbit, -1, axis=0)
-    span = partition.high - partition.low
+    images, partition = true_map.images(orbit, control, noise, check), true_map.partition
     with np.errstate(invalid="ignore"):
-        miss -= np.where(partition.periodic, np.round(miss / span), 0.0) * span
+        miss = partition.deviation(images, np.roll(orbit, -1, axis=0))
     off = np.abs(miss / partition.width).max(axis=1)
-    for k in range(q):
+    for k in range(len(orbit)):
         if not off[k] <= ON_ORBIT:
             raise BadInput(
                 f"point {k} is mapped to {[float(y) for y in images[k]]}, {off[k]:.3g} cell widths "
@@ -260,10 +239,10 @@ def _reach(low: Floats, high: Floats, control: Floats) -> Floats:
 
 
 def _jacobian(
-    problem: Problem,
+    true_map: TrueMap,
     orbit: Floats,
     control: Floats,
-    noise: Floats,
+    noise: list[Floats],
     unit: Floats,
     check: Check,
 ) -> Floats:
@@ -271,44 +250,37 @@ def _jacobian(
 
     They are per unit of each variable: cell widths, and the reach of the controls.
     """
-    step, q = problem.step(), len(orbit)
-    names = (*problem.states, *problem.controls)
-    at = np.concatenate([orbit, control], axis=1)
-    fixed = {name: np.full(q, noise[j]) for j, name in enumerate(problem.noises)}
-    if not hasattr(step, "enclose"):
-        return np.moveaxis(_differences(step, names, at, fixed, unit), 2, 0)
-    jets = {
-        name: Jet.variable(Interval.point(at[:, j]), j, len(names)) for j, name in enumerate(names)
-    }
-    jets |= {name: Jet.constant(x, len(names)) for name, x in fixed.items()}
+    at, d = np.concatenate([orbit, control], axis=1), orbit.shape[1]
+    jets = [Jet.variable(Interval.point(y), j, len(at.T)) for j, y in enumerate(at.T)]
+    fixed = [Jet.constant(y, len(at.T)) for y in noise]
+    images = true_map.enclose(jets[:d], jets[d:], fixed, check)
+    if images is None:
+        return np.moveaxis(_differences(true_map, at, noise, unit), 2, 0)
     slopes = []
     with np.errstate(invalid="ignore", over="ignore"):
-        for image, own in zip(step.enclose(jets, check), unit, strict=False):
+        for image, own in zip(images, unit, strict=False):
             per = (unit / own)[:, None]
-            low, high = (per * np.broadcast_to(end, (len(names), q)) for end in image.slope)
+            low, high = (per * np.broadcast_to(end, at.T.shape) for end in image.slope)
             sharp = np.isfinite(low) & (high - low <= 1e-6 * (1 + np.abs(low)))
             slopes.append(np.where(sharp, per * image.slope.midpoint, np.nan))
     return np.moveaxis(np.stack(slopes), 2, 0)
 
 
-def _differences(
-    step: Any, names: tuple[str, ...], at: Floats, fixed: dict[str, Floats], unit: Floats
-) -> Floats:
+def _differences(true_map: TrueMap, at: Floats, noise: list[Floats], unit: Floats) -> Floats:
     """Differentiate a Python function by central differences with Richardson's extrapolation."""
-    q = len(at)
+    q, d = len(at), true_map.partition.dimension
 
     def central(j: int, h: float) -> Floats:
         images = []
         for sign in (1.0, -1.0):
-            values = {
-                name: at[:, i] + (sign * h if i == j else 0.0) for i, name in enumerate(names)
-            }
-            images.append(np.stack([np.broadcast_to(y, q) for y in step({**values, **fixed})]))
-        own = unit[: len(images[0]), None]
+            moved = [y + (sign * h if i == j else 0.0) for i, y in enumerate(at.T)]
+            found = true_map(moved[:d], moved[d:], noise)
+            images.append(np.stack([np.broadcast_to(y, q) for y in found]))
+        own = unit[:d, None]
         return np.asarray((images[0] - images[1]) / own * (unit[j] / (2 * h)))
 
     columns = []
-    for j in range(len(names)):
+    for j in range(len(at.T)):
         h = max(1e-2 * float(unit[j]), 1e-5 * float(np.abs(at[:, j]).max()))
         columns.append((4 * central(j, h / 2) - central(j, h)) / 3)
     return np.moveaxis(np.stack(columns), 1, 0)  # (d, d + p, q)

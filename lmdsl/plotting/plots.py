@@ -92,7 +92,8 @@ def portrait(
             raise BadInput("a phase portrait needs two axes", "axes")
         low, high = view.ends(0)
         x = np.linspace(low, high, 2001)
-        image = runs.constant_map(given)(x[:, None], np.tile(list(u.values()), (len(x), 1)))[:, 0]
+        next_of = runs.constant_map(given, partition)
+        image = next_of(x[:, None], np.tile(list(u.values()), (len(x), 1)))[:, 0]
         first = np.array([[low + 0.1234 * (high - low)]])
         orbit = runs.open_loop(given, partition, first, u, steps or 60, fine=False)[:, 0, 0]
         overlays.graph(drawn, view, x, image, orbit)

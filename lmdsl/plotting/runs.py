@@ -16,6 +16,7 @@ from lmdsl.machine import memory
 from lmdsl.model.discretization import control_values, noise_nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.base import OdeSystem
 from lmdsl.systems.named import NamedOde
@@ -52,7 +53,7 @@ def control_vector(
     return dict(zip(names, map(float, values), strict=True))
 
 
-def constant_map(problem: Problem, fine: bool = False) -> Map:
+def constant_map(problem: Problem, partition: Partition, fine: bool = False) -> Map:
     """Return the map (x, u) -> x+ on arrays (r, d) and (r, p), noise held at its mean.
 
     With ``fine`` the map of a differential equation covers 1/PIECES of a step.
@@ -61,19 +62,9 @@ def constant_map(problem: Problem, fine: bool = False) -> Map:
     if fine:
         few = -(-system.substeps // PIECES)
         system = system.model_copy(update={"step": system.step / PIECES, "substeps": few})
-    step = system.compile(problem.states, problem.controls, problem.noises)
-    nodes = noise_nodes(problem)
-    noise = nodes.weights @ nodes.values / nodes.weights.sum()
-
-    def image(x: Floats, u: Floats) -> Floats:
-        values: dict[str, Any] = {k: x[:, i] for i, k in enumerate(problem.states)}
-        values |= {k: u[:, i] for i, k in enumerate(problem.controls)}
-        values |= {k: np.full(len(x), v) for k, v in zip(problem.noises, noise, strict=True)}
-        with np.errstate(all="ignore"):
-            images = step(values)
-        return np.stack([np.broadcast_to(part, len(x)) for part in images], axis=-1)
-
-    return image
+        problem = problem.model_copy(update={"system": system})
+    true_map, noise = TrueMap(problem, partition), noise_nodes(problem).mean()
+    return lambda x, u: true_map.images(x, u, [np.full(len(x), mean) for mean in noise])
 
 
 def open_loop(
@@ -88,7 +79,7 @@ def open_loop(
 
     With ``fine`` a step makes PIECES states.
     """
-    image = constant_map(problem, fine)
+    image = constant_map(problem, partition, fine)
     length = steps * (PIECES if fine else 1) + 1
     memory.require(8 * length * x.size, "runs")
     points = np.full((length, *x.shape), np.nan)
@@ -96,10 +87,10 @@ def open_loop(
     active = np.arange(len(x))
     held = np.tile(list(u.values()), (len(x), 1))
     for n in range(len(points) - 1):
-        following = partition.states(image(points[n, active], held[active]))
+        following, cell = partition.enter(image(points[n, active], held[active]))
         finite = np.isfinite(following).all(axis=1)
         points[n + 1, active[finite]] = following[finite]
-        active = active[partition.locate(list(following.T)) >= 0]
+        active = active[cell >= 0]
         if not len(active):
             break
     return points
@@ -134,8 +125,8 @@ def closed_loop(
     loop, problem, p = result.closed_loop, result.problem, result.partition
     rng = np.random.default_rng(seed)
     fine = is_ode(problem) and not problem.noises
-    inner = constant_map(problem, fine) if fine else None
-    x, cell = loop.enter(x)
+    inner = constant_map(problem, p, fine) if fine else None
+    x, cell = p.enter(x)
     points = [x]
     for _ in range(steps):
         on = np.flatnonzero((cell >= 0) & (result.cell_status[cell] == CellStatus.STABILIZED))

@@ -28,6 +28,7 @@ from lmdsl.problem.schema import FileSchema
 from lmdsl.problem.sets import Attractor, Avoid, Measure
 from lmdsl.problem.system_kinds import SystemUnion
 from lmdsl.systems import FunctionSystem, System
+from lmdsl.systems.base import StateMap
 
 
 class Problem(Declared):
@@ -124,8 +125,8 @@ class Problem(Declared):
         """Names of the noise variables."""
         return tuple(self.noise or ())
 
-    def step(self) -> Any:
-        """Return the system's function from named arrays to images (see systems/base.py)."""
+    def step(self) -> StateMap:
+        """Return the map of the system, from named arrays to images."""
         system: System = self.system
         return system.compile(self.states, self.controls, self.noises)
 

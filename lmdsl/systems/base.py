@@ -1,16 +1,16 @@
 """What a system is: states, and a function that maps arrays of states to their images.
 
-Every system answers one question, ``compile(states, controls, noise)``: a function of named
-arrays that broadcast against each other, which returns one array of images per state. Formulas
-and users' own Python functions meet the same contract, so everything downstream (transitions,
-simulation, plots) treats them alike. Every right-hand side sees the old values.
+Every system answers one question, ``compile(states, controls, noise)``: a :class:`StateMap`.
+Formulas and users' own Python functions meet this one contract, so everything downstream
+(transitions, simulation, proofs, plots) treats them alike. Every right-hand side sees the old
+values.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,6 @@ from lmdsl.formulas.tracing import Recorder
 from lmdsl.machine.forking import cached_property
 
 Array = NDArray[np.float64]
-Step = Callable[..., tuple[Array, ...]]
-"""``step(values, check=None)``: images of named arrays; ``check`` as for a program."""
-
 Substeps = Annotated[int, Field(strict=True, ge=1, le=1000), BeforeValidator(plain)]
 
 
@@ -65,6 +62,37 @@ def program(
     return Program(parsed, parameters)
 
 
+class StateMap(Protocol):
+    """x+ = T(x, u, w) on named arrays, as every system compiles to one."""
+
+    def __call__(self, values: Mapping[str, Any], check: Check | None = None) -> tuple[Array, ...]:
+        """Return new arrays of images, one per state, each in the shape of what it depends on.
+
+        The arrays given broadcast against each other; ``check`` is called now and then, and may
+        raise.
+        """
+
+    @property
+    def formulas(self) -> tuple[Formula, ...] | None:
+        """The images written out as formulas; None where there are none, or too long ones."""
+
+    @property
+    def enclose(self) -> Callable[..., tuple[Jet, ...]] | None:
+        """Encloses images and derivatives on boxes (jets by name, check); None where it cannot."""
+
+    @property
+    def live(self) -> int:
+        """Largest number of arrays at a time, inputs apart."""
+
+    @property
+    def effort(self) -> float:
+        """Number of operations of a call, infinite where unknown."""
+
+    @property
+    def work(self) -> float:
+        """The same with slow functions counted many times, for the time that a sample takes."""
+
+
 class System(Declared):
     """Base of all systems x+ = T(x, u, w)."""
 
@@ -74,7 +102,9 @@ class System(Declared):
         """Return the values of all parameters, defaults included."""
         return self.parameters
 
-    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+    def compile(
+        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+    ) -> StateMap:
         """Return the function from named arrays to the images, one array per state in order."""
         raise NotImplementedError
 
@@ -91,7 +121,9 @@ class MapSystem(System):
     kind: Literal["map"] = "map"
     next: Formulas
 
-    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+    def compile(
+        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+    ) -> StateMap:
         """See :meth:`System.compile`."""
         return program(
             self.next, states, [*states, *controls, *noise], self.parameters, "system.next"
@@ -116,7 +148,9 @@ class OdeSystem(System):
     step: Positive
     substeps: Substeps = 1
 
-    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+    def compile(
+        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+    ) -> StateMap:
         """See :meth:`System.compile`."""
         field = program(
             self.derivative,

@@ -6,6 +6,7 @@ arrays of doubles, and before and after a compilation it is asked the same quest
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ from pydantic import Field
 from lmdsl.common.types import Check
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.surroundings import restore_rounding
-from lmdsl.systems.base import Array, Step, System
+from lmdsl.systems.base import Array, StateMap, System
 
 WHERE = "system.next"
 ALONE, OF_BLOCK = 8, 2
@@ -53,13 +54,18 @@ class FunctionSystem(System):
         """Say that no JSON is a function."""
         return {"not": {}}
 
-    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+    def compile(
+        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+    ) -> StateMap:
         """See :meth:`System.compile`."""
         return FunctionStep(self.next, tuple(states), dict(self.parameters))
 
 
 class FunctionStep:
-    """The step of a :class:`FunctionSystem`, for some order of the states."""
+    """The map of a :class:`FunctionSystem`, for some order of the states."""
+
+    formulas = enclose = None  # nobody knows what it does, nor how long that takes
+    live, effort, work = 16, math.inf, math.inf
 
     def __init__(
         self, function: Callable[..., Any], states: tuple[str, ...], parameters: dict[str, float]

@@ -11,7 +11,7 @@ from pydantic import model_validator
 from lmdsl.common.strict_model import Positive
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
-from lmdsl.systems.base import MapSystem, OdeSystem, Step, Substeps, System
+from lmdsl.systems.base import MapSystem, OdeSystem, StateMap, Substeps, System
 
 
 class NamedSystem(System):
@@ -55,7 +55,9 @@ class NamedSystem(System):
         """Return the same system with its formulas written out."""
         raise NotImplementedError
 
-    def compile(self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]) -> Step:
+    def compile(
+        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+    ) -> StateMap:
         """See :meth:`System.compile`."""
         if set(states) != set(self.formulas):
             raise BadInput(

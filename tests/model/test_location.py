@@ -164,7 +164,7 @@ def test_compilation_and_loop_find_the_same_cells(turns):
     problem = made(far(turns))
     partition = Partition.of(problem)
     sampler = Sampler(problem, partition)
-    loop = lm.solve(made(far(0))).closed_loop
+    loop = lm.solve(made(far(0))).closed_loop.partition
     rng = np.random.default_rng(0)
     unwrapped = 0
     for block in sampler.blocks(np.arange(50)):

@@ -56,7 +56,8 @@ def test_portrait_of_one_dimension_is_a_cobweb(solved):
 def test_lines_of_an_ode_pass_through_the_states_of_the_model(solved):
     result = solved("lorenz")
     x = np.array([[5.0, 5.0, 20.0], [-19.0, 0.0, 30.0]])
-    coarse, fine = (runs.constant_map(result.problem, fine) for fine in (False, True))
+    p = result.partition
+    coarse, fine = (runs.constant_map(result.problem, p, fine) for fine in (False, True))
     u = np.full((2, 1), 30.0)
     image = x
     for _ in range(runs.PIECES):

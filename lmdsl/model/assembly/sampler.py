@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,9 @@ from lmdsl.model import discretization
 from lmdsl.model.assembly.lines import Lines
 from lmdsl.model.assembly.merging import mean_cost
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
+from lmdsl.systems.base import StateMap
 from lmdsl.systems.function import Audit, FunctionStep
 
 CHUNK = 2**17
@@ -88,6 +90,8 @@ class Sampler:
         Control vectors, shape (M, p).
     check
         Raises once the deadline has passed.
+    true_map
+        The map, by axis.
     step, cost
         Map and stage cost of named arrays; they raise once the deadline has passed.
     """
@@ -104,17 +108,16 @@ class Sampler:
         self.controls = discretization.control_vectors(problem)
         self.nodes = discretization.noise_nodes(problem)
         self.samples = len(self.points) * len(self.nodes.weights)
-        step, cost = _step(problem), Program([problem.cost()], problem.system.constants())
+        self.true_map = TrueMap(problem, partition)
+        step = _written(problem, self.true_map.map)
+        cost = Program([problem.cost()], problem.system.constants())
         self._images, self._costs = _split(problem, step, cost)
         self.check = check = partial(Deadline.of(deadline).check, doing)
         self.step, self.cost = partial(step, check=check), partial(cost, check=check)
         self._audit: Audit | None = None
         self._offset = np.ascontiguousarray(self.points.T)[:, :, None]
         self._control = np.ascontiguousarray(self.controls.T)
-        self._noise = {
-            name: np.ascontiguousarray(self.nodes.values[:, k])[None, None, :, None]
-            for k, name in enumerate(problem.noises)
-        }
+        self._noise = np.ascontiguousarray(self.nodes.values.T)[:, None, None, :, None]
 
     def blocks(self, cells: NDArray[np.int64]) -> Iterator[Block]:
         """Yield blocks of about CHUNK samples, ordered by cell, then control."""
@@ -132,16 +135,13 @@ class Sampler:
         """Return named arrays that broadcast to the samples of a block (see the module)."""
         cells_last = block.cells_last
         index = self.partition.multi_index(block.cells)
-        named = {}
-        for k, name in enumerate(self.problem.states):
-            low, width = self.partition.low[k], self.partition.width[k]
-            x = low + (index[k] + self._offset[k]) * width  # (points, cells)
-            named[name] = x[None, :, None, :] if cells_last else x.T.copy()[:, :, None, None]
-        for k, name in enumerate(self.problem.controls):
-            u = self._control[k][block.controls[0] : block.controls[1]]
-            named[name] = u[:, None, None, None] if cells_last else u[None, None, None, :]
-        named.update(self._noise)
-        return named
+        states = []
+        for k, offset in enumerate(self._offset):
+            x = self.partition.low[k] + (index[k] + offset) * self.partition.width[k]
+            states.append(x[None, :, None, :] if cells_last else x.T.copy()[:, :, None, None])
+        u = self._control[:, slice(*block.controls)]
+        controls = u[:, :, None, None, None] if cells_last else u[:, None, None, None, :]
+        return self.true_map.named(states, list(controls), list(self._noise))
 
     def audit(self, cells: NDArray[np.int64]) -> Audit | None:
         """Ask a user's function about a few pairs, before all; None for formulas.
@@ -199,18 +199,18 @@ class Sampler:
         return mean
 
 
-def _step(problem: Problem) -> Any:
-    """Return the step, as one program where it can be written out: the same, with fewer arrays."""
-    step = problem.step()
-    formulas = getattr(step, "formulas", None)  # a user's function has none
-    if formulas is None or isinstance(step, Program):
+def _written(problem: Problem, step: StateMap) -> StateMap:
+    """Return the map as one program where it can be written out: the same, with fewer arrays."""
+    if step.formulas is None or isinstance(step, Program):
         return step
-    return Program(formulas, problem.system.constants())
+    return Program(step.formulas, problem.system.constants())
 
 
-def _split(problem: Problem, step: Any, cost: Program) -> tuple[Lines | None, Lines | None]:
+def _split(problem: Problem, step: StateMap, cost: Program) -> tuple[Lines | None, Lines | None]:
     """Return how images and costs are made line by line, one and the same for both if possible."""
-    images = Lines.of(step, problem.controls) if isinstance(step, Program) else None
+    if not isinstance(step, Program):
+        return None, Lines.of(cost, problem.controls)
+    images = Lines.of(step, problem.controls)
     if images is not None:
         joint = Program([*step.formulas, *cost.formulas], problem.system.constants())
         both = Lines.of(joint, problem.controls)

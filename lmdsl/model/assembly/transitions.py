@@ -111,7 +111,7 @@ def _blocks(problem: Problem, S: int) -> int:
     step, cost = problem.step(), Program([problem.cost()], problem.system.constants())
     d, samples, count = len(problem.state_box), max(CHUNK, S), threads.count()
     # States, images and their cells, the arrays of a formula, keys and rows.
-    live = max(getattr(step, "live", 16), cost.live)
+    live = max(step.live, cost.live)
     each = 8 * samples * (3 * d + live + 8)
     waiting = 8 * (count - 1) * 16 * samples  # finished blocks, for their turn
     return count * each + waiting
@@ -148,8 +148,8 @@ def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
     samples = discretization.sample_points(problem) * discretization.node_count(problem)
     step, cost = problem.step(), Program([problem.cost()], problem.system.constants())
     calls = 2 + 2 * lanes * min(samples, CHUNK) // CHUNK
-    work = lanes * samples * (SAMPLE + getattr(step, "work", math.inf) + cost.work)
-    work += CALL * calls * (getattr(step, "effort", math.inf) + cost.effort)
+    work = lanes * samples * (SAMPLE + step.work + cost.work)
+    work += CALL * calls * (step.effort + cost.effort)
     attractor, avoid, measure = problem.attractor, problem.avoid, problem.measure
     boxes = [attractor.boxes, avoid.boxes if avoid else (), (measure and measure.boxes) or ()]
     count = sum(map(len, boxes))
@@ -158,7 +158,7 @@ def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
     if density is not None:
         work += N * Program([density], problem.system.constants()).work
     if problem.local_controller is not None:  # linearised: some fifty operations for each
-        work += 50 * CALL * getattr(step, "effort", math.inf)
+        work += 50 * CALL * step.effort
     return Deadline() if work <= SHORT else deadline
 
 

@@ -165,6 +165,17 @@ class Partition(Frozen):
         columns = [axis.state(images[:, k], saturate) for k, axis in enumerate(self.axes)]
         return np.stack(columns, axis=-1)
 
+    def enter(self, images: Floats) -> tuple[Floats, Indices]:
+        """Return the states that images or starts become, shape (r, d), and their cells."""
+        states = self.states(images)
+        return states, self.locate(list(states.T))
+
+    def deviation(self, x: Floats, point: Floats) -> Floats:
+        """Return x - point, on periodic axes the shortest way round."""
+        away, span = x - point, self.high - self.low
+        turns = np.where(self.periodic, np.round(away / span), 0.0)
+        return np.asarray(away - turns * span)
+
     def domain(self, cell: NDArray[np.integer]) -> tuple[Floats, Floats, Indices]:
         """Return boxes that hold all states, sample points and corners of cells.
 

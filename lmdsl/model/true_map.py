@@ -1,0 +1,67 @@
+"""The true map x+ = T(x, u, w) of a problem, and the states and cells that its images become."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lmdsl.common.types import Check, Floats, Indices
+from lmdsl.formulas.enclosures import Jet
+from lmdsl.model.grid.partition import Partition
+from lmdsl.problem.problem import Problem
+from lmdsl.systems.base import StateMap
+
+
+class TrueMap:
+    """x+ = T(x, u, w) as declared, not the finite model that is made from its samples.
+
+    States, controls and noise are given by axis: one array (or jet) for each name, in order; they
+    broadcast against each other.
+
+    Attributes
+    ----------
+    problem, partition
+        What declares the map, and the cells of its states.
+    map
+        The map on named arrays.
+    names
+        Of the states, the controls, and the noise.
+    """
+
+    def __init__(self, problem: Problem, partition: Partition) -> None:
+        self.problem, self.partition = problem, partition
+        self.map: StateMap = problem.step()
+        self.names = (*problem.states, *problem.controls, *problem.noises)
+
+    def named(self, x: Sequence[Any], u: Sequence[Any], w: Sequence[Any]) -> dict[str, Any]:
+        """Return states, controls and noise by name."""
+        return dict(zip(self.names, (*x, *u, *w), strict=True))
+
+    def __call__(
+        self, x: Sequence[Any], u: Sequence[Any], w: Sequence[Any], check: Check | None = None
+    ) -> tuple[Floats, ...]:
+        """Return the images by axis, not wrapped, each in the shape of what it depends on."""
+        return self.map(self.named(x, u, w), check)
+
+    def enclose(
+        self, x: Sequence[Jet], u: Sequence[Jet], w: Sequence[Jet], check: Check | None = None
+    ) -> tuple[Jet, ...] | None:
+        """Enclose images and derivatives on boxes; None where nothing encloses the map."""
+        enclose = self.map.enclose
+        return None if enclose is None else enclose(self.named(x, u, w), check)
+
+    def images(
+        self, x: Floats, u: Floats, w: Sequence[Floats], check: Check | None = None
+    ) -> Floats:
+        """Return the images of states (r, d) under controls (r, p), not wrapped, shape (r, d)."""
+        return np.stack(
+            [np.broadcast_to(y, len(x)) for y in self(list(x.T), list(u.T), w, check)], axis=-1
+        )
+
+    def step(
+        self, x: Floats, u: Floats, w: Sequence[Floats], check: Check | None = None
+    ) -> tuple[Floats, Indices]:
+        """Return the next states, wrapped or clipped, shape (r, d), and their cells, -1 outside."""
+        return self.partition.enter(self.images(x, u, w, check))
