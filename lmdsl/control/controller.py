@@ -13,7 +13,7 @@ from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.local_controller import LocalController
+from lmdsl.model.local.controller import LocalController
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from lmdsl.formulas.program import FUNCTION
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.discretization import noise_nodes
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.local_controller import LocalController
+from lmdsl.model.local.controller import LocalController
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 

@@ -28,7 +28,7 @@ from lmdsl.model.assembly.transitions import assemble, require_least, unless_sho
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.local_controller import LocalController
+from lmdsl.model.local.controller import LocalController
 from lmdsl.model.rows import Rows
 from lmdsl.model.sets import Regions
 from lmdsl.model.stabilizable_set import CellStatus

@@ -15,7 +15,7 @@ from lmdsl.control.invariance import check
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.local_controller import LocalController
+from lmdsl.model.local.controller import LocalController
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem

@@ -24,7 +24,7 @@ from lmdsl.machine.forking import cached_property
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.local_controller import LocalController
+from lmdsl.model.local.controller import LocalController
 from lmdsl.model.sets import Regions
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem

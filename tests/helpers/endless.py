@@ -47,7 +47,7 @@ def local(nodes=5, substeps=2, cells=400):
 def checked(problem, *arguments, **more):
     from lmdsl.control.invariance import check
     from lmdsl.model.grid.partition import Partition
-    from lmdsl.model.local_controller import LocalController
+    from lmdsl.model.local.controller import LocalController
     from lmdsl.model.sets import Regions
 
     partition = Partition.of(problem)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.local_controller import LocalController
+from lmdsl.model.local.controller import LocalController
 from lmdsl.model.sets import Regions
 
 ORBIT = [{"x": 0.25, "y": 0.5}, {"x": 0.75, "y": 0.5}]

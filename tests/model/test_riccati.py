@@ -10,7 +10,7 @@ from local_controllers import ORBIT, linear_system, local_of
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl.model import riccati
+from lmdsl.model.local import riccati
 
 
 def gain(A, B, Q, R):

@@ -15,7 +15,7 @@ from lmdsl.control.invariance import SAMPLES, LocalCheck
 from lmdsl.control.invariance import check as check_local
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.sampler import Sampler
-from lmdsl.model.local_controller import LocalController
+from lmdsl.model.local.controller import LocalController
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.optimize.feasibility import gamma_bar

@@ -18,21 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.frozen import Frozen
-from lmdsl.common.types import Check, Floats, Indices
+from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput
-from lmdsl.formulas.enclosures import Jet
-from lmdsl.formulas.intervals import Interval
 from lmdsl.machine.deadline import Deadline
-from lmdsl.model import riccati
 from lmdsl.model.discretization import control_range, noise_nodes
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local import linearisation, riccati
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
 from lmdsl.problem.problem import Problem
 
 MAX_RICCATI = 256  # states of the Riccati equation: orbit points times axes
 PART = 2**12  # states compared with all points of an orbit at a time
-ON_ORBIT = 1e-3  # cell widths by which a point may miss its successor
 
 
 def _on_arrays(operation: str, *operands: Any) -> Any:
@@ -115,10 +112,10 @@ class LocalController(Frozen):
         true_map = TrueMap(problem, partition)
         noise = [np.full(q, mean) for mean in noise_nodes(problem).mean()]
         check = partial(Deadline.of(deadline).check, "linearising along the orbit")
-        _refuse_unless_orbit(true_map, orbit, control, noise, check)
-        width, reach = partition.width, _reach(low, high, control)
+        linearisation.refuse_unless_orbit(true_map, orbit, control, noise, check)
+        width, reach = partition.width, linearisation.reach(low, high, control)
         unit = np.concatenate([width, reach])
-        jacobian = _jacobian(true_map, orbit, control, noise, unit, check)
+        jacobian = linearisation.jacobian(true_map, orbit, control, noise, unit, check)
         A, B = jacobian[:, :, :d], jacobian[:, :, d:]
         smooth = bool(np.isfinite(jacobian).all())
         if isinstance(declared, LinearFeedback):
@@ -213,77 +210,6 @@ def _inside(orbit: Floats, partition: Partition, attractor: NDArray[np.bool_]) -
         block = partition.around_point([float(x) for x in point], where)
         if not attractor[partition.mask([block])].any():
             raise BadInput("the point lies in no attractor cell; add it to the attractor", where)
-
-
-def _refuse_unless_orbit(
-    true_map: TrueMap, orbit: Floats, control: Floats, noise: list[Floats], check: Check
-) -> None:
-    images, partition = true_map.images(orbit, control, noise, check), true_map.partition
-    with np.errstate(invalid="ignore"):
-        miss = partition.deviation(images, np.roll(orbit, -1, axis=0))
-    off = np.abs(miss / partition.width).max(axis=1)
-    for k in range(len(orbit)):
-        if not off[k] <= ON_ORBIT:
-            raise BadInput(
-                f"point {k} is mapped to {[float(y) for y in images[k]]}, {off[k]:.3g} cell widths "
-                "from the next point; give the orbit more precisely, in the order visited, with "
-                "its controls",
-                "local_controller.orbit",
-            )
-
-
-def _reach(low: Floats, high: Floats, control: Floats) -> Floats:
-    """Return the largest distance from a control of the orbit to a value; 1 where it is 0."""
-    far = np.maximum(np.abs(low - control), np.abs(high - control)).max(axis=0)
-    return np.where(far > 0, far, 1.0)
-
-
-def _jacobian(
-    true_map: TrueMap,
-    orbit: Floats,
-    control: Floats,
-    noise: list[Floats],
-    unit: Floats,
-    check: Check,
-) -> Floats:
-    """Return the derivatives by states and controls, shape (q, d, d + p); NaN at a kink.
-
-    They are per unit of each variable: cell widths, and the reach of the controls.
-    """
-    at, d = np.concatenate([orbit, control], axis=1), orbit.shape[1]
-    jets = [Jet.variable(Interval.point(y), j, len(at.T)) for j, y in enumerate(at.T)]
-    fixed = [Jet.constant(y, len(at.T)) for y in noise]
-    images = true_map.enclose(jets[:d], jets[d:], fixed, check)
-    if images is None:
-        return np.moveaxis(_differences(true_map, at, noise, unit), 2, 0)
-    slopes = []
-    with np.errstate(invalid="ignore", over="ignore"):
-        for image, own in zip(images, unit, strict=False):
-            per = (unit / own)[:, None]
-            low, high = (per * np.broadcast_to(end, at.T.shape) for end in image.slope)
-            sharp = np.isfinite(low) & (high - low <= 1e-6 * (1 + np.abs(low)))
-            slopes.append(np.where(sharp, per * image.slope.midpoint, np.nan))
-    return np.moveaxis(np.stack(slopes), 2, 0)
-
-
-def _differences(true_map: TrueMap, at: Floats, noise: list[Floats], unit: Floats) -> Floats:
-    """Differentiate a Python function by central differences with Richardson's extrapolation."""
-    q, d = len(at), true_map.partition.dimension
-
-    def central(j: int, h: float) -> Floats:
-        images = []
-        for sign in (1.0, -1.0):
-            moved = [y + (sign * h if i == j else 0.0) for i, y in enumerate(at.T)]
-            found = true_map(moved[:d], moved[d:], noise)
-            images.append(np.stack([np.broadcast_to(y, q) for y in found]))
-        own = unit[:d, None]
-        return np.asarray((images[0] - images[1]) / own * (unit[j] / (2 * h)))
-
-    columns = []
-    for j in range(len(at.T)):
-        h = max(1e-2 * float(unit[j]), 1e-5 * float(np.abs(at[:, j]).max()))
-        columns.append((4 * central(j, h / 2) - central(j, h)) / 3)
-    return np.moveaxis(np.stack(columns), 1, 0)  # (d, d + p, q)
 
 
 def _regulator(

@@ -1,0 +1,1 @@
+"""The local controller: feedback on the attractor cells, and the linearisation it rests on."""
