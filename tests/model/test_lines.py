@@ -37,8 +37,8 @@ def compared(problem, blocks=3):
         assert agree(drawn.outcomes(block), expected)
     images, costs = drawn._images, drawn._costs
     return (
-        images is not None and max(images.late[: len(problem.states)]) >= 0,
-        costs is not None and costs.late[-1] >= 0,
+        images is not None and max(images.varying[: len(problem.states)]) >= 0,
+        costs is not None and costs.varying[-1] >= 0,
     )
 
 
@@ -137,8 +137,8 @@ def test_small_images_are_located_once(monkeypatch):
     problem = made(data)
     assert compared(problem) == (True, True)
     drawn, _ = sampled(problem)
-    assert drawn._images.late[0] == -1
-    assert drawn._images.late[1] >= 0
+    assert drawn._images.varying[0] == -1
+    assert drawn._images.varying[1] >= 0
 
 
 def test_the_kernel_against_a_plain_reference():

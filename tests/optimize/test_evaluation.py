@@ -60,7 +60,7 @@ def test_a_leap_stays_above_its_equation(escape, make):
         b = rng.uniform(0.1, 1.0, n)
         x = above(M, b, rng)
         before, V = x.copy(), exact(M, b)
-        t = extrapolation.leap(gauss_seidel.System.of(M), b, x)
+        t = extrapolation.extrapolate(gauss_seidel.System.of(M), b, x)
         assert t >= 1
         assert (x <= before * (1 + 1e-15)).all()
         assert (x >= V * (1 - 1e-12)).all()
@@ -74,7 +74,7 @@ def test_a_leap_removes_the_one_slow_mode():
     system, V = gauss_seidel.System.of(M), exact(M, b)
     start = above(M, b, rng)
     x, plain = start.copy(), start.copy()
-    t = extrapolation.leap(system, b, x)
+    t = extrapolation.extrapolate(system, b, x)
     system.sweep(b, plain, 20)
     assert t == pytest.approx(100, rel=0.2)  # 1 / (1 - rate)
     assert np.abs(x / V - 1).max() < 0.1 * np.abs(plain / V - 1).max()
@@ -86,10 +86,10 @@ def test_a_leap_is_not_taken_from_below_nor_at_the_solution():
     b = rng.uniform(0.1, 1.0, 300)
     system, V = gauss_seidel.System.of(M), exact(M, b)
     below, swept = 0.5 * V, 0.5 * V
-    assert extrapolation.leap(system, b, below) == 1
+    assert extrapolation.extrapolate(system, b, below) == 1
     system.sweep(b, swept, extrapolation.SWEEPS)
     np.testing.assert_array_equal(below, swept)
-    assert extrapolation.leap(system, b, V) == 1
+    assert extrapolation.extrapolate(system, b, V) == 1
 
 
 @pytest.mark.parametrize("escape", [0.5, 0.02, 1e-3, 1e-6])
@@ -181,12 +181,12 @@ def test_policies_of_mixing_models_are_the_same_with_and_without_leaps(monkeypat
         start = iteration.bound(lp, pair, w)
         done = iteration.iterate(lp, pair, start)
         with monkeypatch.context() as patch:
-            patch.setattr(extrapolation, "leap", lambda *_: 1.0)
+            patch.setattr(extrapolation, "extrapolate", lambda *_: 1.0)
             plain = iteration.iterate(lp, pair, start)
         np.testing.assert_allclose(done.value, plain.value, rtol=1e-11)
         screen = Screen(lp)
         screen.slots.system(done.policy)
-        taken += not Peeled.of(screen.slots.held).small
+        taken += not Peeled.of(screen.slots.current).small
     assert taken
 
 

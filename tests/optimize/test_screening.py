@@ -89,7 +89,7 @@ def test_passes_agree_with_numpy_and_bounds_hold(monkeypatch, ranges):
             np.testing.assert_array_equal(done.policy, new)
             assert done.changed == (new != pair).sum()
             np.testing.assert_array_equal(screen.slots.chosen, new)
-            np.testing.assert_array_equal(screen.paid, lp.cost[new])
+            np.testing.assert_array_equal(screen.policy_cost, lp.cost[new])
             left_out += lp.K - done.looked
             screen.follow(V, done.value)
             pair, V = done.policy, done.value

@@ -43,7 +43,7 @@ class Lines:
     ----------
     early
         The program of the small arrays: those outputs that are small, then the inputs of the rest.
-    late
+    varying
         For each output its row among the lines, -1 where it is small.
     tape
         Code, rows of both operands and row of the result of every instruction, shape (., 4).
@@ -54,7 +54,7 @@ class Lines:
     """
 
     early: Program
-    late: tuple[int, ...]
+    varying: tuple[int, ...]
     tape: Integers
     constants: Floats
     rows: int
@@ -70,15 +70,15 @@ class Lines:
         controls
             Names of the values that vary along one axis, all others varying along the rest.
         """
-        late = _late(program, controls)
-        if late is None or not LEAST <= len(late) <= MOST:
+        varying = _varying(program, controls)
+        if varying is None or not LEAST <= len(varying) <= MOST:
             return None
-        made = {step.target for step in late}
-        read = dict.fromkeys(k for step in late for k in step.operands if k not in made)
+        made = {step.target for step in varying}
+        read = dict.fromkeys(k for step in varying for k in step.operands if k not in made)
         inputs = [k for k in read if program.template[k] is None]
         constants = [k for k in read if program.template[k] is not None]
         row = {k: r for r, k in enumerate([*inputs, *constants])}
-        tape, rows = _placed(late, row, {k for k in program.outputs if k in made})
+        tape, rows = _placed(varying, row, {k for k in program.outputs if k in made})
         return cls(
             program.part([*(k for k in program.outputs if k not in made), *inputs]),
             tuple(row[k] if k in made else -1 for k in program.outputs),
@@ -116,7 +116,7 @@ class Lines:
             As :func:`lmdsl.model.assembly.merging.mean_cost` has it; None where the cost is small.
         """
         arrays = list(self.early(values))
-        small = [row < 0 for row in self.late]
+        small = [row < 0 for row in self.varying]
         found, inputs = iter(arrays[: sum(small)]), arrays[sum(small) :]
         base: Any = None  # images on axes that do not depend on the control: located once for all
         for axis, early in zip(axes, small, strict=False):
@@ -124,19 +124,19 @@ class Lines:
                 part = axis.add_index(next(found), clip, None)
                 base = part if base is None else base + part
         axes = list(axes) if not all(small[: len(axes)]) else []
-        located = [(axis, row) for axis, row in zip(axes, self.late, strict=False) if row >= 0]
+        located = [(axis, row) for axis, row in zip(axes, self.varying, strict=False) if row >= 0]
         first, points, nodes, last = shape
         index = np.empty((first if located else 0, points * nodes, last))
-        paid = self.late[-1] if weights is not None else -1
-        mean = np.zeros((first if paid >= 0 else 0, last))
+        cost_at = self.varying[-1] if weights is not None else -1
+        mean = np.zeros((first if cost_at >= 0 else 0, last))
         packed = _Inputs.of(inputs if base is None else [*inputs, base])
         _run(
             LINE, self.tape, self.constants, self.rows, len(inputs), *packed, *shape,
             np.array([row for _, row in located], dtype=np.int64),
             np.array([axis for axis, _ in located], dtype=np.float64).reshape(-1, 6),
-            clip, index, paid, np.ones(nodes) if weights is None else weights, mean,
+            clip, index, cost_at, np.ones(nodes) if weights is None else weights, mean,
         )  # fmt: skip
-        return (index if located else None), (mean if paid >= 0 else None)
+        return (index if located else None), (mean if cost_at >= 0 else None)
 
 
 class _Inputs(NamedTuple):
@@ -169,13 +169,13 @@ class _Inputs(NamedTuple):
         return cls(flat, start, stride)
 
 
-def _late(program: Program, controls: Collection[str]) -> list[Instruction] | None:
+def _varying(program: Program, controls: Collection[str]) -> list[Instruction] | None:
     """Return the instructions whose results vary with a control and something else, in order.
 
     None where one of them is not plain arithmetic. A square becomes a product.
     """
     varies = {k: (name in controls, name not in controls) for name, k in program.variables.items()}
-    late = []
+    varying = []
     for step in program.instructions:
         kinds = [varies.get(k, (False, False)) for k in step.operands]
         varies[step.target] = any(c for c, _ in kinds), any(o for _, o in kinds)
@@ -186,23 +186,23 @@ def _late(program: Program, controls: Collection[str]) -> list[Instruction] | No
             operation, operands = "*", (operands[0], operands[0])
         if operation not in PLAIN:
             return None
-        late.append(Instruction(operation, operands, step.target))
-    return late
+        varying.append(Instruction(operation, operands, step.target))
+    return varying
 
 
 def _placed(
-    late: Iterable[Instruction], row: dict[int, int], kept: Collection[int]
+    varying: Iterable[Instruction], row: dict[int, int], kept: Collection[int]
 ) -> tuple[list[tuple[int, int, int, int]], int]:
     """Give every result a row, in ``row``; those that nothing reads any more are used again.
 
     No result takes the row of an operand, so that the loops of the kernel may run on vectors.
     """
-    late = list(late)
+    varying = list(varying)
     given, rows = set(row), len(row)
     free: list[int] = []
-    reader = {k: t for t, step in enumerate(late) for k in step.operands}
+    reader = {k: t for t, step in enumerate(varying) for k in step.operands}
     tape = []
-    for t, step in enumerate(late):
+    for t, step in enumerate(varying):
         if free:
             row[step.target] = free.pop()
         else:
@@ -217,7 +217,7 @@ def _placed(
 @kernel(allocates=True)
 def _run(  # type: ignore[no-untyped-def]
     long, tape, constants, rows, inputs, flat, start, stride, first, points, nodes, last,
-    located, axes, clip, index, paid, weights, mean,
+    located, axes, clip, index, cost_at, weights, mean,
 ):  # fmt: skip
     """Fill ``index`` and ``mean``, those of length 0 apart; see :meth:`Lines.__call__`.
 
@@ -233,7 +233,7 @@ def _run(  # type: ignore[no-untyped-def]
         The shape of the block.
     located, axes
         Rows to locate, and the numbers of their axes.
-    paid
+    cost_at
         Row of the cost.
     """
     work, least = np.empty((rows, long)), np.zeros(mean.shape)
@@ -258,7 +258,7 @@ def _run(  # type: ignore[no-untyped-def]
                     for a in range(len(located)):
                         _locate(work[located[a]][:n], axes[a], clip, line)
                 if len(mean):
-                    add_cost(work[paid], weights[q], mean[i, j : j + n], least[i, j : j + n])
+                    add_cost(work[cost_at], weights[q], mean[i, j : j + n], least[i, j : j + n])
     total = points * weights.sum()
     for i in range(len(mean)):
         settle_cost(mean[i], least[i], total)

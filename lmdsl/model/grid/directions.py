@@ -1,10 +1,10 @@
 """Orders in which sweeps visit the cells: along every axis of the box, in both directions.
 
-A Gauss-Seidel sweep carries news all the way in the direction in which it visits the cells, and a
-cell or two in others. The news of a controlled system, what it costs to get home, goes against
-its flow, which turns: a pendulum swings through all four quadrants of its plane. Sweeps in
-every combination of directions, one after the other, follow it ("fast sweeping", Zhao, Math.
-Comp. 74, 2005). From one sweep to the next a single axis turns, the first axis first.
+A Gauss-Seidel sweep carries values all the way in the direction in which it visits the cells, and a
+cell or two in others. What it costs to get home, in a controlled system, goes against its flow,
+which turns: a pendulum swings through all four quadrants of its plane. Sweeps in every combination
+of directions, one after the other, follow it ("fast sweeping", Zhao, Math. Comp. 74, 2005).
+From one sweep to the next a single axis turns, the first axis first.
 """
 
 from __future__ import annotations

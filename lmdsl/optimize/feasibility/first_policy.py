@@ -75,11 +75,11 @@ def _proved(lp: StabilizationLP, policy: Pairs, w: Floats, stop: Stop) -> Floats
         ones = np.ones(lp.n)
         return ones if proves(ones) else None
 
-    paid = rows.small and bool((cost > 0).all())
-    for paid_for in (cost, np.ones(lp.n)) if paid else (np.ones(lp.n),):
+    positive_cost = rows.small and bool((cost > 0).all())
+    for used_cost in (cost, np.ones(lp.n)) if positive_cost else (np.ones(lp.n),):
         proof, before = w.copy(), np.inf
         for _ in range(MOST_ROUNDS):
-            left = equations.advance(rows, paid_for, proof, SWEEPS, 0.0, 0.25)
+            left = equations.advance(rows, used_cost, proof, SWEEPS, 0.0, 0.25)
             if left == np.inf:
                 return even()
             if proves(proof):
@@ -89,7 +89,7 @@ def _proved(lp: StabilizationLP, policy: Pairs, w: Floats, stop: Stop) -> Floats
             if stop():
                 raise Stopped
             before = left
-        if left > TOLERANCE and equations.lift(rows, paid_for, proof) and proves(proof):
+        if left > TOLERANCE and equations.lift(rows, used_cost, proof) and proves(proof):
             return proof
     return even()
 

@@ -17,7 +17,7 @@ LEAST_FALL, FARTHEST = 1e-10, 1e4
 ROUNDING = 1e-13
 
 
-def leap(system: System, b: Floats, x: Floats) -> float:
+def extrapolate(system: System, b: Floats, x: Floats) -> float:
     """Lower x >= b + M x in place, mostly along the mode in which sweeps stall; return how far.
 
     A few sweeps, then Jacobi steps, which take r = x - (b + M x) from x and turn it into M r: soon

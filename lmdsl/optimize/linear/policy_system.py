@@ -23,7 +23,7 @@ class Slots:
     ----------
     rows
         The rows of all pairs.
-    room
+    capacity
         Largest number of entries that the row of each cell may have, shape (n,).
     gamma
         Weight of the rows.
@@ -32,14 +32,14 @@ class Slots:
     """
 
     def __init__(
-        self, rows: Rows, room: NDArray[np.int64], gamma: float, directions: Directions
+        self, rows: Rows, capacity: NDArray[np.int64], gamma: float, directions: Directions
     ) -> None:
         self.rows, self.gamma = rows, gamma
-        ends = np.cumsum(room)
-        count, entries = len(room), int(ends[-1]) if len(room) else 0
+        ends = np.cumsum(capacity)
+        count, entries = len(capacity), int(ends[-1]) if len(capacity) else 0
         self.chosen = np.full(count, rows.count, dtype=np.uint64)  # none
-        self.held = System(
-            (ends - room).view(np.uint64),
+        self.current = System(
+            (ends - capacity).view(np.uint64),
             np.empty(count, dtype=np.uint64),
             np.empty(entries, dtype=np.uint32),
             np.empty(entries),
@@ -52,13 +52,13 @@ class Slots:
         cls, rows: Rows, pair_pointer: NDArray[np.int64], gamma: float, directions: Directions
     ) -> Slots:
         """Make room for any policy, a pair of each cell's own."""
-        room = np.empty(len(pair_pointer) - 1, dtype=np.int64)
+        capacity = np.empty(len(pair_pointer) - 1, dtype=np.int64)
 
         def longest(span: tuple[int, int]) -> None:
-            _longest(*span, pair_pointer.view(np.uint64), rows.kernel[0], room)
+            _longest(*span, pair_pointer.view(np.uint64), rows.kernel[0], capacity)
 
-        threads.each(longest, spans(len(room)))
-        return cls(rows, room, gamma, directions)
+        threads.each(longest, spans(len(capacity)))
+        return cls(rows, capacity, gamma, directions)
 
     def system(self, chosen: NDArray[np.int64]) -> System:
         """Return gamma P for one row of each cell; it holds until the next call."""
@@ -68,12 +68,12 @@ class Slots:
             _fill(*span, now, *self.kernel)
 
         threads.each(fill, spans(len(chosen)))
-        return self.held
+        return self.current
 
     @property
     def kernel(self) -> tuple[Any, ...]:
         """The row held of each cell, all rows, and the system, as compiled loops use them."""
-        s, columns = self.held, np.uint32(self.rows.columns)
+        s, columns = self.current, np.uint32(self.rows.columns)
         return (
             self.chosen, *self.rows.kernel, columns, self.gamma,
             s.begin, s.end, s.indices, s.data, s.inverse,
@@ -81,14 +81,14 @@ class Slots:
 
 
 @kernel
-def _longest(first, last, pair_pointer, pointer, room):  # type: ignore[no-untyped-def]
+def _longest(first, last, pair_pointer, pointer, capacity):  # type: ignore[no-untyped-def]
     """Find the largest number of entries among the rows of each cell."""
     for i in range(np.uint64(first), np.uint64(last)):
         most = np.uint64(0)
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             length = pointer[k + ONE] - pointer[k]
             most = length if length > most else most
-        room[i] = most
+        capacity[i] = most
 
 
 @kernel
@@ -126,5 +126,5 @@ def copy_row(  # type: ignore[no-untyped-def]
 def of_policy(lp: StabilizationLP, policy: Pairs, gamma: float) -> System:
     """Return gamma P_u for a policy, ready for sweeps."""
     rows = lp.rows
-    room = rows.pointer[policy + 1] - rows.pointer[policy]
-    return Slots(rows, room, gamma, lp.directions).system(policy)
+    capacity = rows.pointer[policy + 1] - rows.pointer[policy]
+    return Slots(rows, capacity, gamma, lp.directions).system(policy)

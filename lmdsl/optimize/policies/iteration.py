@@ -93,7 +93,7 @@ def iterate(
     Each step changes every control for which another one is better by a relative 1e-12. Then the
     new policy u is evaluated: to the end where few cells lie on cycles, else by sweeps
     V <- T_u V, about as long as the improvement took, or by a leap along the one mode in which they
-    stall (:func:`~extrapolation.leap`); not at all after the first step, and every
+    stall (:func:`~extrapolation.extrapolate`); not at all after the first step, and every
     second time where few controls changed. V >= T_u V stays true whatever the number of sweeps, so
     V falls and every policy on the way is gamma-stabilizing (docs/mathematics.md, Policy
     iteration); only a policy evaluated to the end is returned as the last.
@@ -118,23 +118,23 @@ def iterate(
             else:
                 x = x.copy()
                 sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
-                rows = Peeled.of(screen.slots.held)  # the pass copied them
+                rows = Peeled.of(screen.slots.current)  # the pass copied them
                 fall = 0.0 if rows.small else _fall(V, x)
                 far, left = 0.0, np.inf
                 if stalls and not rows.small:
-                    far = extrapolation.leap(rows.system, screen.paid, x)
+                    far = extrapolation.extrapolate(rows.system, screen.policy_cost, x)
                     stalls = 2 * far > sweeps
-                paid = bool((screen.paid > 0).all())  # else what is free has to become 0
-                slow = swept > PATIENCE and paid
+                positive = bool((screen.policy_cost > 0).all())  # else what is free has to become 0
+                slow = swept > PATIENCE and positive
                 if slow:
                     enough = 0.1 * (fall or _fall(V, x))
-                    slow = equations.descend(rows, screen.paid, x, enough, stop)
+                    slow = equations.descend(rows, screen.policy_cost, x, enough, stop)
                     swept = swept if slow else 0
                 if far < sweeps and not slow:
-                    left = equations.advance(rows, screen.paid, x, sweeps, 0.1 * fall, 0.0)
+                    left = equations.advance(rows, screen.policy_cost, x, sweeps, 0.1 * fall, 0.0)
                     if left > TOLERANCE and left > 0.1 * (fall or _fall(V, x)):
                         swept += sweeps
-                exact = x if left <= TOLERANCE and paid else None
+                exact = x if left <= TOLERANCE and positive else None
                 x = np.minimum(x, done.value)
             screen.follow(V, x)
             policy, V = done.policy, x

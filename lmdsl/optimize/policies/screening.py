@@ -63,7 +63,7 @@ class Screen:
 
     Attributes
     ----------
-    slots, paid
+    slots, policy_cost
         The rows of the policy after the last pass, copied while they are at hand, and its stage
         costs, shape (n,).
     """
@@ -75,7 +75,7 @@ class Screen:
         self.gamma = lp.gamma if gamma is None else gamma
         self.cost = lp.cost if cost is None else cost
         self.rival = np.zeros(lp.n)
-        self.paid = np.full(lp.n, np.nan)
+        self.policy_cost = np.full(lp.n, np.nan)
         self.scale = 1.0
         self.passes = 0
         self.policy: Pairs | None = None  # whose rivals
@@ -109,7 +109,7 @@ class Screen:
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(
                 *cells, lp.kernel[0], self.cost, x.copy(), own, margin, self.scale, backwards,
-                self.rival, value, new.view(np.uint64), self.paid, *slots,
+                self.rival, value, new.view(np.uint64), self.policy_cost, *slots,
             )  # fmt: skip
             return int(changed), int(looked)
 
@@ -168,8 +168,9 @@ def _least_ratio(before: Floats, after: Floats) -> float:
 
 @kernel
 def _pass(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, cost, x, policy, margin, scale, backwards, rival, value, new, paid,
-    held, pointer, target, code, share, columns, gamma, begins, ends, indices, data, inverse,
+    first, last, pair_pointer, cost, x, policy, margin, scale, backwards, rival, value, new,
+    policy_cost, current, pointer, target, code, share, columns, gamma, begins, ends, indices,
+    data, inverse,
 ):  # fmt: skip
     """Improve the cells of a range in turn; ``rival`` gets the bounds of those that were read.
 
@@ -210,9 +211,9 @@ def _pass(  # type: ignore[no-untyped-def]
             if best < x[i]:
                 x[i] = best
             rival[i] = second * store if second * store < MOST else MOST
-        if held[i] != new[i]:  # its row is at hand now
-            held[i] = new[i]
-            paid[i] = cost[new[i]]
+        if current[i] != new[i]:  # its row is at hand now
+            current[i] = new[i]
+            policy_cost[i] = cost[new[i]]
             copy_row(
                 i, new[i], pointer, target, code, share, columns, gamma,
                 begins, ends, indices, data, inverse,
