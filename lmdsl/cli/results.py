@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from importlib import import_module
 from pathlib import Path
 
 from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
 from lmdsl.cli.streams import say
 from lmdsl.errors import printable
+from lmdsl.results.formats import FORMATS
 
 AS_STORED = "the result as stored, not re-checked; see lmdsl verify"
 
@@ -38,8 +40,8 @@ def add(command: Command) -> None:
 
     export = command("export", _export, "Write a saved result in a format for other readers.")
     export.add_argument("dir", metavar="DIR", help="result directory")
-    export.add_argument("--format", required=True, choices=("certificate", "drn"),
-                        help="certificate: to be checked alone; drn: for Storm")  # fmt: skip
+    uses = "; ".join(f"{name}: {use}" for name, use in FORMATS.items())
+    export.add_argument("--format", required=True, choices=FORMATS, help=uses)
     export.add_argument("--out", required=True, metavar="FILE", help="file to write")
     _time_limit(export)
 
@@ -92,7 +94,6 @@ def _plot(parsed: Arguments) -> int:
 
 def _export(parsed: Arguments) -> int:
     from lmdsl.results.directory.writing import refuse_own_file
-    from lmdsl.results.exports import export_certificate, export_drn
     from lmdsl.results.result import Result
     from lmdsl.results.verification import recompiled
 
@@ -100,9 +101,6 @@ def _export(parsed: Arguments) -> int:
     result = Result.load(parsed.dir)
     with Progress() as progress:
         lp = recompiled(parsed.dir, result, progress, parsed.time_limit)
-    if parsed.format == "drn":
-        export_drn(lp, parsed.out)
-    else:
-        export_certificate(result, parsed.out, lp)
+    import_module(f"lmdsl.results.exports.{parsed.format}").write(result, lp, parsed.out)
     say(f"written to {printable(parsed.out)}")
     return 0

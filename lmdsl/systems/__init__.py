@@ -2,46 +2,27 @@
 
 from __future__ import annotations
 
-from lmdsl.systems.base import MapSystem, OdeSystem, System
-from lmdsl.systems.double_integrator import DoubleIntegrator
-from lmdsl.systems.function import FunctionSystem
-from lmdsl.systems.henon_map import HenonMap
-from lmdsl.systems.inverted_pendulum import InvertedPendulum
-from lmdsl.systems.logistic_map import LogisticMap
-from lmdsl.systems.lorenz import Lorenz
-from lmdsl.systems.named import NamedSystem
-from lmdsl.systems.pendulum_on_cart import PendulumOnCart
-from lmdsl.systems.standard_map import StandardMap
-from lmdsl.systems.van_der_pol import VanDerPol
+from lmdsl.systems.base import MapSystem as MapSystem
+from lmdsl.systems.base import OdeSystem as OdeSystem
+from lmdsl.systems.base import System as System
+from lmdsl.systems.function import FunctionSystem as FunctionSystem
+from lmdsl.systems.named import NamedSystem as NamedSystem
+
+# A line for each system known by name, in the order in which they are listed.
+# isort: off
+from lmdsl.systems.standard_map import StandardMap as StandardMap
+from lmdsl.systems.logistic_map import LogisticMap as LogisticMap
+from lmdsl.systems.henon_map import HenonMap as HenonMap
+from lmdsl.systems.double_integrator import DoubleIntegrator as DoubleIntegrator
+from lmdsl.systems.inverted_pendulum import InvertedPendulum as InvertedPendulum
+from lmdsl.systems.pendulum_on_cart import PendulumOnCart as PendulumOnCart
+from lmdsl.systems.van_der_pol import VanDerPol as VanDerPol
+from lmdsl.systems.lorenz import Lorenz as Lorenz
+# isort: on
 
 NAMED: dict[str, type[NamedSystem]] = {
-    str(cls.model_fields["kind"].default): cls
-    for cls in (
-        StandardMap,
-        LogisticMap,
-        HenonMap,
-        DoubleIntegrator,
-        InvertedPendulum,
-        PendulumOnCart,
-        VanDerPol,
-        Lorenz,
-    )
+    str(system.model_fields["kind"].default): system
+    for system in list(globals().values())
+    if isinstance(system, type) and issubclass(system, NamedSystem) and system is not NamedSystem
 }
 """Every system known by name, by its ``kind``."""
-
-__all__ = [
-    "NAMED",
-    "DoubleIntegrator",
-    "FunctionSystem",
-    "HenonMap",
-    "InvertedPendulum",
-    "LogisticMap",
-    "Lorenz",
-    "MapSystem",
-    "NamedSystem",
-    "OdeSystem",
-    "PendulumOnCart",
-    "StandardMap",
-    "System",
-    "VanDerPol",
-]

@@ -69,6 +69,11 @@ def export_certificate(
     write_whole(inputs.path(path), _lines(_head(result, lp, refused), result, lp, refused))
 
 
+def write(result: Result, lp: StabilizationLP, path: str) -> None:
+    """Write a result for ``lmdsl export``."""
+    export_certificate(result, path, lp)
+
+
 def _part(lp: StabilizationLP, result: Result) -> StabilizationLP:
     """Return the part of the model that a result restricted to its gamma speaks of."""
     beyond = result.cell_status[lp.cells] == CellStatus.BEYOND_GAMMA

@@ -16,6 +16,7 @@ from lmdsl.errors import BadInput
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.results.directory.writing import refuse_own_file
+from lmdsl.results.result import Result
 
 
 @own_arithmetic
@@ -53,6 +54,11 @@ def export_drn(lp: StabilizationLP, path: str | os.PathLike[str]) -> None:
         raise BadInput("no cell of `measure` is stabilizable; there is no initial state")
     refuse_own_file(inputs.path(path))
     write_whole(inputs.path(path), _lines(lp))
+
+
+def write(result: Result, lp: StabilizationLP, path: str) -> None:
+    """Write the model of a result for ``lmdsl export``."""
+    export_drn(lp, path)
 
 
 def _lines(lp: StabilizationLP) -> Iterator[bytes]:

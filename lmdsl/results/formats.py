@@ -1,0 +1,13 @@
+"""What ``lmdsl export`` can write.
+
+A format NAME is a module ``lmdsl/results/exports/NAME.py`` with ``write(result, lp, path)``, and a
+line here. Nothing is imported before it is asked for.
+"""
+
+from __future__ import annotations
+
+FORMATS = {
+    "certificate": "to be checked alone",
+    "drn": "for Storm",
+}
+"""For whom each format is, by name."""
