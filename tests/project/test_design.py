@@ -183,3 +183,11 @@ def test_no_file_is_too_long():
         if (n := len(path.read_text().splitlines())) > 500
     }
     assert not long
+
+
+def test_no_test_file_is_too_long():
+    lengths = {
+        path.name: len(path.read_text().splitlines())
+        for path in (PACKAGE.parent / "tests").rglob("test_*.py")
+    }
+    assert {name for name, lines in lengths.items() if lines > 400} == set()
