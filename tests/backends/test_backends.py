@@ -85,6 +85,7 @@ def test_units_of_the_cost_do_not_matter_on_the_standard_map(spec):
     assert found.value / 1e-9 == pytest.approx(reference(), rel=1e-5)
 
 
+@pytest.mark.long
 @fast
 def test_no_cost_is_worth_nothing(spec):
     lp = standard_map()

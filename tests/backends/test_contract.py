@@ -36,6 +36,7 @@ def test_our_backends_keep_the_contract(spec):
     assert {check.name for check in report.skipped} <= allowed
 
 
+@pytest.mark.long
 def test_osqp_is_honest_where_it_does_not_converge():
     # A first-order method: its own iteration limit on two of the LPs, said as such or, through
     # CVXPY before 1.7, as a failure.

@@ -146,6 +146,7 @@ def test_a_backend_with_a_broken_record_is_bad_input(lp, broken):
         lm.solve(lp, broken)
 
 
+@pytest.mark.long
 def test_a_backend_that_exits_does_not_end_the_command(site, tmp_path):
     (site / "quitting.py").write_text(
         "import sys\nfrom lmdsl.backends import Backend\n"

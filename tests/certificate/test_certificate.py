@@ -100,6 +100,7 @@ def test_spoiled_measure(solved, i):
     assert not judged(lp, witness, mu=spoiled(witness.mu, i, np.nan)).measure
 
 
+@pytest.mark.long
 def test_spoiled_policy(solved):
     lp, witness = solved
     rng = np.random.default_rng(0)

@@ -253,6 +253,7 @@ def test_text_is_read_as_strictly_as_a_file():
 # The caller's settings of NumPy --------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", ["raise", "warn", "ignore"])
 def test_the_callers_error_handling_changes_nothing(mode, tmp_path):
     problem = made(standard_map(12))

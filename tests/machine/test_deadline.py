@@ -84,6 +84,7 @@ def test_the_command_says_so(tmp_path, capsys):
     assert len(json.loads(capsys.readouterr().out)["results"]) == 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("threads", [1, 2])
 def test_it_ends_within_a_block(monkeypatch, threads):
     monkeypatch.setattr("lmdsl.machine.threads.count", lambda: threads)
@@ -188,6 +189,7 @@ def test_verifying_ends_too_and_claims_no_more_than_it_proved(monkeypatch):
             assert getattr(cut.certificate, name) <= getattr(whole.certificate, name)
 
 
+@pytest.mark.long
 def test_the_local_check_ends_with_what_it_knows():
     problem = local(nodes=2, substeps=1)
     whole = Asked()

@@ -34,6 +34,7 @@ LONG = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LONG)
 def test_what_is_long_by_another_way_is_no_moment(name):
     cells = 4 if "sampl" in name else 10**6
@@ -63,6 +64,7 @@ def test_an_enclosure_is_ended_within_a_step():
     assert cut.count < 45
 
 
+@pytest.mark.long
 def test_a_step_of_the_true_map_is_ended_too():
     result = lm.solve(made(sines(points=1, substeps=100)))
     whole = Asked()
@@ -129,6 +131,7 @@ def test_verify_in_rational_arithmetic_asks_between_blocks(saved, monkeypatch):
     assert many.count > few.count + 50
 
 
+@pytest.mark.long
 def test_a_local_controller_is_checked_whole_or_not_at_all(tmp_path):
     problem = local(cells=8, substeps=1)
     lm.solve(problem).save(tmp_path / "out")

@@ -164,6 +164,7 @@ def test_a_fork_waits_for_who_compiles_or_imports(lock):
     """)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("backend", ["policy-iteration", "highs"])
 def test_forks_while_other_threads_solve(backend):
     run(f"""

@@ -88,6 +88,7 @@ def test_lost_streams(tmp_path, command):
 # The rest of the environment ------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["module://matplotlib_inline.backend_inline", "nonsense"])
 def test_a_notebook_s_matplotlib_backend_does_not_matter(tmp_path, noisy, name):
     lm.solve(made(steps())).save(tmp_path / "out")

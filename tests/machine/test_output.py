@@ -38,6 +38,7 @@ def test_only_our_object_is_on_standard_output(tmp_path, noisy, arguments, statu
         assert done.stderr.count("NOISE puts solve") == arguments.count("noisy")
 
 
+@pytest.mark.long
 @posix
 def test_text_is_not_disturbed_and_control_characters_are_escaped(tmp_path, noisy):
     done = python(tmp_path, noisy, "-m", "lmdsl", "solve", "problem.json", "--backend", "noisy")
@@ -108,6 +109,7 @@ sys.exit(not result.verified)
 """
 
 
+@pytest.mark.long
 @posix
 @pytest.mark.parametrize(
     ("how", "raw"),

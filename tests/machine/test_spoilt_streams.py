@@ -44,6 +44,7 @@ BACKEND = backends.Backend("noisy", solve)
 """
 
 
+@pytest.mark.long
 @posix
 @pytest.mark.parametrize("how", SPOILT)
 def test_streams_that_a_backend_spoils(tmp_path, noisy, how):

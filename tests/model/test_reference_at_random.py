@@ -36,6 +36,7 @@ def test_random_problems_are_reproducible_and_json():
         assert json.dumps(one, allow_nan=False) == json.dumps(two, allow_nan=False)
 
 
+@pytest.mark.long
 def test_random_problems_vary(drawn):
     seen = Counter()
     for problem, model in drawn:

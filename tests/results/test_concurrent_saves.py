@@ -161,6 +161,7 @@ def test_reading_while_others_write(tmp_path, results, writers, locks, monkeypat
     assert names(tmp_path) == {"out"}
 
 
+@pytest.mark.long
 def test_a_new_directory_by_several(tmp_path, results, often):
     """Each takes the others' unfinished folders for those of killed saves; none is left behind."""
     for k in range(40):

@@ -315,6 +315,7 @@ def test_a_file_written_anew_is_judged_and_named(tmp_path):
     assert "solution.npz was written anew" in found.notes[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("form", [[], ["--json"]])
 def test_what_is_not_checked_is_said(tmp_path, capsys, form):
     lm.solve(made(steps())).save(tmp_path / "out")

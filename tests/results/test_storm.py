@@ -44,6 +44,7 @@ def at_one(request, tmp_path):
     return result, tmp_path / "model.drn"
 
 
+@pytest.mark.long
 def test_the_model_for_storm_is_the_model(at_one):
     result, path = at_one
     lp = result.lp

@@ -208,6 +208,7 @@ def test_loading_opens_no_other_file_and_runs_nothing(tmp_path):
 ANY = st.text(st.characters(codec=None, exclude_categories=()), max_size=40)
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(name=ANY)
 @example(name="\x1b[2J\x9b31m\r\x08\u2028\u202e\U000e0001\ufeff")

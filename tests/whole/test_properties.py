@@ -332,6 +332,7 @@ def test_no_false_claim_passes():
 # Backends -----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_backends_agree_or_say_why():
     """The same status, cost, values and controls as policy iteration, or a reason.
 
