@@ -175,11 +175,8 @@ def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[Cause, st
         return Cause.EMPTY, "no cell can be kept in the box and brought to the attractor"
     if not lp.weight.any():
         return Cause.MEASURE, "no cell of measure is stabilizable; enlarge its boxes"
-    outside = (
-        lp.partition.size
-        - lp.n
-        - int(np.isin(lp.cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID)).sum())
-    )
+    given = np.isin(lp.cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID))
+    outside = lp.partition.size - lp.n - int(given.sum())
     if require_all and outside:
         return (
             Cause.REQUIRE_ALL,

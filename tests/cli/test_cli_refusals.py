@@ -164,6 +164,11 @@ def test_unreadable_results(capsys, file, tmp_path):
         "status": lambda f: spoil_certificate(f, status="fine"),
         "types": lambda f: spoil_certificate(f, gap="0"),
         "seconds": lambda f: spoil_certificate(f, seconds={"a": 1}),
+        "cause": lambda f: spoil_certificate(f, cause="fate"),
+        "claims": lambda f: spoil_certificate(f, claims={"stabilizing": 1}),
+        "more seconds": lambda f: spoil_certificate(
+            f, seconds={"compile": None, "solve": None, "verify": None, "save": None}
+        ),
         "reasons": lambda f: spoil_certificate(f, reasons=[1]),
         "problem gone": lambda f: (f / "problem.json").unlink(),
     }

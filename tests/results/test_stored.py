@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 import math
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from lmdsl.cli import main
 from lmdsl.common import arrays
 from lmdsl.results.directory import reading
 from lmdsl.results.directory.audit import NOT_CLAIMED
+from lmdsl.results.directory.certificate_file import CertificateFile
+from lmdsl.results.report import Report
 from lmdsl.systems import FunctionSystem
 
 ORBIT = [[0.25, 0.5], [0.75, 0.5]]
@@ -94,6 +97,25 @@ def places(data, path=()):
             yield from places(value, (*path, key))
         else:
             yield (*path, key), value
+
+
+def test_a_word_of_a_result_is_plain_text(tmp_path):
+    result = lm.solve(made(doubling(3.0)))
+    result.save(tmp_path / "out")
+    for found in (result, lm.Result.load(tmp_path / "out")):
+        assert (found.status, found.cause) == ("not_stabilizable", "gamma")
+        assert f"{found.status} {found.cause!r}" == "not_stabilizable 'gamma'"
+        assert repr(found).startswith("Result(status='not_stabilizable', backend=")
+        assert type(found.to_dict()["status"]) is str
+
+
+def test_what_a_certificate_says_is_what_a_result_holds():
+    """A key of the report is saved and read again where the certificate names it, and it does."""
+    apart = {"format", "claims", "measure_residual", "reasons", "versions", "scope"}
+    held = {field.name for field in fields(lm.Result)} | {"beyond_gamma"}
+    keys = {*CertificateFile.model_fields}
+    assert keys - apart <= held
+    assert {field.name for field in fields(Report)} - {"simulation"} <= keys
 
 
 # True statements that say less, and are accepted.
