@@ -1,28 +1,21 @@
-"""The checks of all claims, fast; what is extreme is judged exactly."""
+"""Every claim checked fast; what is extreme is judged exactly."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 
 from lmdsl.certificate import bounds, exact_sums, sums
-from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.certificate.sums import rounded_up, total_above
 from lmdsl.common.types import Floats, Pairs
-from lmdsl.machine import threads
-from lmdsl.model import algorithm_1
 from lmdsl.model.lp import StabilizationLP
 
 MEASURE_TOLERANCE = 1e-9
 
 MOST_EXACT = 200_000
 """Transitions of a policy that are judged exactly where numbers are extreme: 0.5 s a claim."""
-
-MANY = 10_000
-"""Cells from which on two claims are judged in two threads."""
 
 
 def check_stabilizing(lp: StabilizationLP, policy: Pairs, w: Floats) -> float | None:
@@ -119,66 +112,6 @@ def _rows(lp: StabilizationLP, policy: Pairs) -> list[exact_sums.Row]:
     return [row for _, row in exact_sums.rows(lp, policy)]
 
 
-def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
-    """Check every claim of a witness against the finite model.
-
-    Parameters
-    ----------
-    lp
-        The finite model.
-    witness
-        Policy and vectors; nothing in it is trusted.
-    tolerance
-        Largest gap that counts as verified.
-    """
-    policy = witness.policy
-    V_up, W, mu, w = witness.V_up, witness.W, witness.mu, witness.w
-    if policy is not None and not is_policy(lp, policy):
-        policy = None
-    contraction = cost = floor = None
-    residual: tuple[float, bool] | None = None
-    upper = False
-    if policy is not None:
-        under, own = lp.under(policy), np.arange(lp.n)
-
-        def of_policy() -> tuple[float | None, bool]:
-            proved = None if w is None else check_stabilizing(under, own, w)
-            return proved, V_up is not None and check_upper(under, own, V_up)
-
-        def of_measure() -> tuple[float, bool] | None:
-            return None if mu is None else check_measure(under, own, mu)
-
-        claims, residual = threads.both(of_policy, of_measure, lp.n >= MANY)
-        contraction, upper = claims
-    lower = W is not None and check_lower(lp, W)
-    if upper and V_up is not None:
-        cost = sums.weighted(lp.weight, V_up, math.inf)
-        upper = cost < math.inf
-    if lower and W is not None:
-        floor = sums.weighted(lp.weight, W, -math.inf)
-    certificate = Certificate(
-        stabilizing=contraction is not None,
-        upper_bound=upper,
-        lower_bound=lower,
-        measure=residual is not None and residual[1],
-        refusal=policy is None and w is not None and check_refusal(lp, w),
-        contraction=contraction,
-        cost=cost if upper else None,
-        lower=floor,
-        gap=gap(lp, V_up, W) if upper and lower else None,
-        measure_residual=None if residual is None else residual[0],
-        tolerance=tolerance,
-    )
-    return explained(lp, policy, with_stated_gap(certificate))
-
-
-def with_stated_gap(proof: Certificate) -> Certificate:
-    """Return a certificate with at least the gap that its rounded cost and lower bound show."""
-    if proof.gap is None or proof.cost is None or proof.lower is None:
-        return proof
-    return replace(proof, gap=sums.stated_gap(proof.gap, proof.cost, proof.lower))
-
-
 def weighted(lp: StabilizationLP, values: Floats) -> float:
     """Return m'values, rounded to nearest."""
     return sums.total(lp.weight * values)
@@ -189,61 +122,6 @@ def is_policy(lp: StabilizationLP, policy: Pairs) -> bool:
     if policy.shape != (lp.n,) or not lp.n:
         return False
     return bool((policy >= lp.pair_pointer[:-1]).all() and (policy < lp.pair_pointer[1:]).all())
-
-
-def explained(lp: StabilizationLP, policy: Pairs | None, certificate: Certificate) -> Certificate:
-    """Return the certificate with the reasons why it is not verified."""
-    reasons = []
-    if certificate.refusal:
-        reasons.append(f"proved: no policy has finite cost at gamma = {lp.gamma!r}")
-    elif policy is None:
-        reasons.append("there is no policy to verify")
-    elif not certificate.stabilizing:
-        reasons.append(_not_stabilizing(lp, policy))
-    if policy is not None:
-        if not certificate.upper_bound:
-            reasons.append("no upper bound on the cost of the policy could be established")
-        if not certificate.lower_bound:
-            reasons.append("no lower bound on the optimal cost could be established")
-        if not certificate.measure:
-            shown = certificate.measure_residual
-            reasons.append(
-                "the Lyapunov measure could not be established"
-                + (
-                    ""
-                    if shown is None
-                    else f": its residual is {shown:.2g}, above 1e-9 of its size; the numbers "
-                    "no longer allow it, lower gamma"
-                )
-            )
-        width = certificate.gap
-        if width is not None and width > certificate.tolerance:
-            reasons.append(
-                f"the gap {width:.3g} is above the tolerance {certificate.tolerance:.3g}"
-                + _too_small(certificate.cost)
-            )
-    return replace(certificate, reasons=tuple(reasons))
-
-
-def _too_small(cost: float | None) -> str:
-    if cost is None or not cost < sums.NORMAL:
-        return ""
-    return (
-        f": the cost {cost!r} is below the normal range of doubles, which are coarse there; "
-        "multiply stage_cost by a power of ten"
-    )
-
-
-def _not_stabilizing(lp: StabilizationLP, policy: Pairs) -> str:
-    lost = int((~algorithm_1.reaches_attractor(lp, policy)).sum())
-    if lost and lp.gamma < 1:
-        return (
-            f"from {lost} of {lp.n} cells the policy never reaches the attractor: at gamma = "
-            f"{lp.gamma!r} < 1 staying away can be cheaper than going; raise gamma to 1"
-        )
-    if lost:
-        return f"from {lost} of {lp.n} cells the policy never reaches the attractor"
-    return "no contraction of the policy could be proved: the numbers do not allow it"
 
 
 def gap(lp: StabilizationLP, V_up: Floats | None, W: Floats | None) -> float:

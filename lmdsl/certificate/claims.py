@@ -19,7 +19,7 @@ A solver's status plays no part. A claim that almost holds is repaired or refuse
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from lmdsl.common.json_values import jsonable
 from lmdsl.common.types import Floats, Pairs
@@ -65,7 +65,7 @@ class Certificate:
     @property
     def verified(self) -> bool:
         """Claims 1 to 4 hold and the gap is within the tolerance."""
-        claims = all(getattr(self, name) for name in CLAIMS)
+        claims = self.stabilizing and self.upper_bound and self.lower_bound and self.measure
         return claims and self.gap is not None and self.gap <= self.tolerance
 
     def __str__(self) -> str:
@@ -106,4 +106,11 @@ class Verified:
     witness: Witness = field(repr=False)
 
 
-# The checks: from vectors to yes or no ------------------------------------------------------
+class Found(NamedTuple):
+    """Whether a claim holds, and the number that goes with it."""
+
+    holds: bool
+    number: float | None = None
+
+
+NOTHING = Found(False)

@@ -1,77 +1,78 @@
-"""Every claim of a certificate in rational arithmetic, without rounding."""
+"""Every claim in rational arithmetic, without rounding: whether it holds, and its number.
+
+A claim that holds only with equality holds. Numbers are rounded at the end, costs and residuals up,
+the lower bound down.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
 
 from lmdsl.certificate import exact_sums
-from lmdsl.certificate.checks import (
-    allowed_residual,
-    explained,
-    is_policy,
-    is_sound,
-    with_stated_gap,
-)
-from lmdsl.certificate.claims import Certificate, Witness
+from lmdsl.certificate.checks import allowed_residual
+from lmdsl.certificate.claims import NOTHING, Found
 from lmdsl.certificate.sums import LARGEST, rounded_down, rounded_up
-from lmdsl.common.types import Check
+from lmdsl.common.types import Check, Pairs
 from lmdsl.model.lp import StabilizationLP
 
-
-def check_exactly(
-    lp: StabilizationLP, witness: Witness, tolerance: float, check: Check | None = None
-) -> Certificate:
-    """Check every claim of a witness in rational arithmetic.
-
-    Parameters
-    ----------
-    lp, witness, tolerance
-        As for :func:`lmdsl.certificate.claims.check`; a claim that holds only with equality holds.
-    check
-        Called now and then; it may raise.
-    """
-    policy = (
-        witness.policy if witness.policy is not None and is_policy(lp, witness.policy) else None
-    )
-    V_up, W, w, mu = (
-        exact_sums.fractions(x) if x is not None and is_sound(lp, x) else None
-        for x in (witness.V_up, witness.W, witness.w, witness.mu)
-    )
-    rows = None if policy is None else [row for _, row in exact_sums.rows(lp, policy, check)]
-    contraction = cost = floor = residual = gap = None
-    if rows is not None and policy is not None:
-        if w is not None:
-            contraction = exact_sums.contraction(lp, rows, w)
-        if V_up is not None and exact_sums.above_policy(lp, rows, policy, V_up):
-            cost = _mean(lp, V_up)
-        if mu is not None:
-            residual = exact_sums.residual(lp, rows, mu)
-    if W is not None and exact_sums.below_all(lp, W, lp.cost, check):
-        floor = _mean(lp, W)
-    if cost is not None and cost > LARGEST:
-        cost = None
-    if cost is not None and floor is not None:
-        gap = max((cost - floor) / cost, Fraction(0)) if cost else Fraction(0)
-    certificate = Certificate(
-        stabilizing=contraction is not None and contraction < 1,
-        upper_bound=cost is not None,
-        lower_bound=floor is not None,
-        measure=residual is not None and mu is not None and residual <= allowed_residual(mu),
-        refusal=policy is None
-        and w is not None
-        and any(w)
-        and exact_sums.below_all(lp, w, None, check),
-        contraction=None if contraction is None or contraction >= 1 else rounded_up(contraction),
-        cost=None if cost is None else rounded_up(cost),
-        lower=None if floor is None else rounded_down(floor),
-        gap=None if gap is None else rounded_up(gap),
-        measure_residual=None if residual is None else rounded_up(residual),
-        tolerance=tolerance,
-    )
-    return explained(lp, policy, with_stated_gap(certificate))
+Fractions = list[Fraction]
 
 
-def _mean(lp: StabilizationLP, values: list[Fraction]) -> Fraction:
+@dataclass(frozen=True, eq=False)
+class ExactModel:
+    """A model with the rows of a policy read once; ``check`` is called now and then."""
+
+    lp: StabilizationLP
+    policy: Pairs
+    rows: list[exact_sums.Row]
+    check: Check | None
+
+
+ExactCheck = Callable[[ExactModel, Fractions], Found]
+
+
+def stabilizing(model: ExactModel, w: Fractions) -> Found:
+    """Claim 1, and the contraction."""
+    found = exact_sums.contraction(model.lp, model.rows, w)
+    return NOTHING if found is None or found >= 1 else Found(True, rounded_up(found))
+
+
+def upper_bound(model: ExactModel, V_up: Fractions) -> Found:
+    """Claim 2, and m'V_up."""
+    if not exact_sums.above_policy(model.lp, model.rows, model.policy, V_up):
+        return NOTHING
+    cost = mean(model.lp, V_up)
+    return NOTHING if cost > LARGEST else Found(True, rounded_up(cost))
+
+
+def lower_bound(model: ExactModel, W: Fractions) -> Found:
+    """Claim 3, and m'W."""
+    if not exact_sums.below_all(model.lp, W, model.lp.cost, model.check):
+        return NOTHING
+    return Found(True, rounded_down(mean(model.lp, W)))
+
+
+def measure(model: ExactModel, mu: Fractions) -> Found:
+    """Claim 4, and its residual."""
+    residual = exact_sums.residual(model.lp, model.rows, mu)
+    return Found(residual <= allowed_residual(mu), rounded_up(residual))
+
+
+def refusal(model: ExactModel, w: Fractions) -> Found:
+    """Claim 6."""
+    return Found(any(w) and exact_sums.below_all(model.lp, w, None, model.check))
+
+
+def gap(lp: StabilizationLP, V_up: Fractions, W: Fractions) -> float:
+    """Return the gap of claim 5, rounded up."""
+    cost = mean(lp, V_up)
+    return rounded_up(max((cost - mean(lp, W)) / cost, Fraction(0)) if cost else Fraction(0))
+
+
+def mean(lp: StabilizationLP, values: Fractions) -> Fraction:
+    """Return m'values."""
     return sum(
         (Fraction(m) * x for m, x in zip(lp.weight.tolist(), values, strict=True)), Fraction(0)
     )

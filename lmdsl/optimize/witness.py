@@ -1,6 +1,6 @@
 """Making the vectors behind a certificate: good guesses, repaired until the checks accept them.
 
-Nothing here is trusted: certificate.check judges what comes out.
+Nothing here is trusted: the judge decides on what comes out.
 """
 
 from __future__ import annotations
@@ -12,9 +12,7 @@ import numpy as np
 
 from lmdsl.certificate import bounds
 from lmdsl.certificate.checks import (
-    MANY,
     MEASURE_TOLERANCE,
-    check,
     check_lower,
     check_measure,
     check_upper,
@@ -22,6 +20,7 @@ from lmdsl.certificate.checks import (
     weighted,
 )
 from lmdsl.certificate.claims import Verified, Witness
+from lmdsl.certificate.judge import MANY, check
 from lmdsl.common.types import Floats, Pairs, Stop, never
 from lmdsl.machine import threads
 from lmdsl.machine.deadline import Stopped

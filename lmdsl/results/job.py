@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.backends import Backend, Solution
-from lmdsl.certificate import checks
+from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Certificate, Verified, Witness
 from lmdsl.control.invariance import check
 from lmdsl.machine.deadline import Deadline
@@ -86,7 +86,7 @@ class _Job:
     ) -> Result:
         if verified is None:
             witness = Witness(None)
-            verified = Verified(checks.check(self.lp, witness, self.tolerance), witness)
+            verified = Verified(judge.check(self.lp, witness, self.tolerance), witness)
         proof = replace(verified.certificate, reasons=(message,))
         return self._result(
             verified.witness,

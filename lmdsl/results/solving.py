@@ -11,7 +11,7 @@ import numpy as np
 from lmdsl import backends
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.asking import ask
-from lmdsl.certificate import checks
+from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Verified, Witness
 from lmdsl.common import inputs
 from lmdsl.common.types import Progress
@@ -190,4 +190,4 @@ def _refuse(lp: StabilizationLP, found: first_policy.Refused, tolerance: float) 
 
     w = lower_until_below(lp, found.w, lp.gamma, None)
     witness = Witness(None, found.w if w is None else w)
-    return Verified(checks.check(lp, witness, tolerance), witness)
+    return Verified(judge.check(lp, witness, tolerance), witness)

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.certificate.checks import check
-from lmdsl.certificate.claims import CLAIMS, Certificate, Witness
-from lmdsl.certificate.exact_checks import check_exactly
+from lmdsl.certificate.claims import Certificate, Witness
+from lmdsl.certificate.judge import CLAIMS, check, check_exactly
 from lmdsl.common import inputs
 from lmdsl.common.json_values import jsonable
 from lmdsl.common.types import Progress
@@ -87,7 +86,7 @@ class Verification:
             "holds": self.holds,
             "status": self.status.value,
             "same_model": self.same_model,
-            "claims": {name: getattr(proof, name) for name in (*CLAIMS, "refusal")},
+            "claims": {claim.name: getattr(proof, claim.name) for claim in CLAIMS},
             "cost": jsonable(proof.cost),
             "lower_bound": jsonable(proof.lower),
             "gap": jsonable(proof.gap),

@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from models import dense, random_lp
 from problems import doubling, made, standard_map, steps
+from truth import CLAIMS
 
 import lmdsl as lm
 from lmdsl.certificate.bounds import exactly_below, holds_for_all
-from lmdsl.certificate.checks import check
-from lmdsl.certificate.claims import CLAIMS, Witness
-from lmdsl.certificate.exact_checks import check_exactly
+from lmdsl.certificate.claims import Witness
+from lmdsl.certificate.judge import check, check_exactly
 from lmdsl.model.rows import Rows
 from lmdsl.optimize import witness
 from lmdsl.optimize.feasibility import first_policy

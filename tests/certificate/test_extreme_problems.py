@@ -15,9 +15,8 @@ from truth import truly
 
 import lmdsl as lm
 from lmdsl.certificate import sums
-from lmdsl.certificate.checks import check
 from lmdsl.certificate.claims import Witness
-from lmdsl.certificate.exact_checks import check_exactly
+from lmdsl.certificate.judge import check, check_exactly
 from lmdsl.model import stabilizable_set
 from lmdsl.model.discretization import Nodes
 from lmdsl.model.rows import Rows, Shares

@@ -15,12 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from extremes import LARGEST, Model, number, numbers
-from truth import truly
+from truth import CLAIMS, truly
 
 from lmdsl.certificate import sums
-from lmdsl.certificate.checks import check
-from lmdsl.certificate.claims import CLAIMS, Witness
-from lmdsl.certificate.exact_checks import check_exactly
+from lmdsl.certificate.claims import Witness
+from lmdsl.certificate.judge import check, check_exactly
 
 TOLERANCE = 1e-6
 

@@ -12,7 +12,7 @@ from models import mdp, random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl.certificate import checks
+from lmdsl.certificate import judge
 from lmdsl.machine import threads
 from lmdsl.model import rows, vectors
 from lmdsl.optimize import witness
@@ -26,7 +26,7 @@ def test_ranges_and_halves_give_the_same_policy(monkeypatch, workers):
     whole = lm.solve(problem)
     monkeypatch.setattr(vectors, "GRAIN", 1)
     monkeypatch.setattr(gauss_seidel, "SPLIT", 1)
-    for room in (rows, substitution, checks, witness):
+    for room in (rows, substitution, judge, witness):
         monkeypatch.setattr(room, "MANY", 1)
     monkeypatch.setattr(threads, "count", lambda: workers)
     parts = lm.solve(problem)

@@ -61,6 +61,10 @@ def write(result, lp, path):
     rows = zip(lp.cells, result.value[lp.cells], strict=True)
     Path(path).write_text("".join(f"{cell},{float(value)!r}\\n" for cell, value in rows))
 """
+CLAIM = """NONNEGATIVE = Claim(
+    "nonnegative", About.POLICY, "V_up", lambda lp, policy, V_up: Found(bool(V_up.min() >= 0)),
+    exact_checks.nonnegative, lambda *_: "it costs less than nothing",
+)"""
 
 
 class Copy:
@@ -156,11 +160,12 @@ def test_a_problem_key_is_its_model_and_its_use(copy):
     copy.assert_as_documented("a problem key")
 
 
-def test_a_claim_is_its_name_and_two_checks(copy):
-    copy.change("certificate/claims.py", r"^(CLAIMS = .*)\)$", r'\1, "nonnegative")')
+def test_a_claim_is_a_field_an_entry_and_an_exact_check(copy):
     copy.line("certificate/claims.py", "reasons: tuple", "nonnegative: bool = False")
-    for name in ("certificate/checks.py", "certificate/exact_checks.py"):
-        copy.line(name, "tolerance=tolerance,", "nonnegative=bool((lp.cost >= 0).all()),")
+    copy.line("certificate/exact_checks.py", "def gap(",
+              "def nonnegative(model, V_up):\n    return Found(min(V_up) >= 0)\n\n\n")  # fmt: skip
+    copy.line("certificate/judge.py", "CLAIMS = (", CLAIM)
+    copy.change("certificate/judge.py", r"^(CLAIMS = .*)\)$", r"\1, NONNEGATIVE)")
     assert copy.solved(steps())["status"] == "verified"
     assert json.loads((copy.folder / "out/certificate.json").read_text())["claims"]["nonnegative"]
     assert json.loads(copy.run("verify", "out", "--json"))["claims"]["nonnegative"]

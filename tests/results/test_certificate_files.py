@@ -15,9 +15,8 @@ from problems import doubling, made, standard_map, steps
 from random_problems import random_problem
 
 import lmdsl as lm
-from lmdsl.certificate.checks import check
 from lmdsl.certificate.claims import Witness
-from lmdsl.certificate.exact_checks import check_exactly
+from lmdsl.certificate.judge import check, check_exactly
 from lmdsl.cli import main
 from lmdsl.results.exports import export_certificate
 

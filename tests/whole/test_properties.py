@@ -18,9 +18,8 @@ from models import mdp, random_lp
 from truth import CLAIMS, SAMPLES, truly
 
 import lmdsl as lm
-from lmdsl.certificate.checks import check
 from lmdsl.certificate.claims import Witness
-from lmdsl.certificate.exact_checks import check_exactly
+from lmdsl.certificate.judge import check, check_exactly
 
 GAMMAS = [0.9, 1.0, 1.0, 1.02, 1.1]
 

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.certificate.claims import CLAIMS, Certificate
+from lmdsl.certificate.claims import Certificate
+from lmdsl.certificate.judge import CLAIMS
 from lmdsl.common import arrays
 from lmdsl.common.files import MAX_FILE_BYTES, parsed, reason
 from lmdsl.common.json_values import jsonable
@@ -109,7 +110,7 @@ def _certificate(result: Result) -> dict[str, Any]:
     apart = {
         "format": FORMAT,
         "beyond_gamma": beyond and beyond.to_dict(),
-        "claims": {name: getattr(proof, name) for name in (*CLAIMS, "refusal")},
+        "claims": {claim.name: getattr(proof, claim.name) for claim in CLAIMS},
         "measure_residual": proof.measure_residual,
         "reasons": proof.reasons,
         "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
@@ -248,7 +249,7 @@ def _result(
     said = dict(stored)
     known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said} | held
     certificate = Certificate(
-        **{name: stored.claims.get(name, False) for name in (*CLAIMS, "refusal")},
+        **{claim.name: stored.claims.get(claim.name, False) for claim in CLAIMS},
         contraction=stored.contraction,
         cost=stored.cost,
         lower=stored.lower_bound,

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.certificate.checks import MEASURE_TOLERANCE
-from lmdsl.certificate.claims import CLAIMS, Certificate
+from lmdsl.certificate.claims import Certificate
+from lmdsl.certificate.judge import CLAIMS
 from lmdsl.common.json_values import jsonable
 from lmdsl.control.invariance import SAMPLES, LocalCheck
 from lmdsl.control.invariance import check as check_local
@@ -59,7 +60,7 @@ def differences(
     """
     reasons = [*_counts(lp, result), *_numbers(result, found), *_outside(lp, result)]
     claims = certificate.claims
-    for name in (*CLAIMS, "refusal"):
+    for name in (claim.name for claim in CLAIMS):
         if claims.get(name) is not getattr(found, name):
             reasons.append(_differs(f"claims.{name}", claims.get(name), getattr(found, name)))
     reasons += _residual(lp, result, certificate.measure_residual, found)

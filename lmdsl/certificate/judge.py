@@ -1,0 +1,255 @@
+"""The claims, one object each, and the judges: a witness in, a certificate out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from lmdsl.certificate import checks, exact_checks, exact_sums, sums
+from lmdsl.certificate.claims import NOTHING, Certificate, Found, Witness
+from lmdsl.common.types import Check, Floats, Pairs
+from lmdsl.machine import threads
+from lmdsl.model.algorithm_1 import reaches_attractor
+from lmdsl.model.lp import StabilizationLP
+
+MANY = 10_000
+"""Cells from which on two claims are judged in two threads."""
+
+
+class About(Enum):
+    """What a claim speaks of."""
+
+    POLICY = "a policy"
+    PAIRS = "all surviving pairs"
+    NO_POLICY = "all surviving pairs, where there is no policy"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A claim: an inequality between stored doubles (see claims.py).
+
+    Attributes
+    ----------
+    name
+        The field of the certificate that says whether it holds.
+    about
+        What it speaks of; a claim of a policy is checked on the model under it.
+    vector
+        The field of the witness that proves it.
+    check, check_exactly
+        Whether a vector proves it, and its number: with bounds of rounding, and in rationals.
+    sentence
+        The reason it gives in a certificate: where it does not hold; a refusal, where it does.
+    number
+        The field of the certificate for its number.
+    """
+
+    name: str
+    about: About
+    vector: str
+    check: Callable[[StabilizationLP, Pairs, Floats], Found]
+    check_exactly: exact_checks.ExactCheck
+    sentence: Callable[[StabilizationLP, Pairs | None, float | None], str]
+    number: str | None = None
+
+
+def _stabilizing(lp: StabilizationLP, policy: Pairs, w: Floats) -> Found:
+    contraction = checks.check_stabilizing(lp, policy, w)
+    return Found(contraction is not None, contraction)
+
+
+def _upper_bound(lp: StabilizationLP, policy: Pairs, V_up: Floats) -> Found:
+    if not checks.check_upper(lp, policy, V_up):
+        return NOTHING
+    cost = sums.weighted(lp.weight, V_up, math.inf)
+    return Found(True, cost) if cost < math.inf else NOTHING
+
+
+def _lower_bound(lp: StabilizationLP, policy: Pairs, W: Floats) -> Found:
+    if not checks.check_lower(lp, W):
+        return NOTHING
+    return Found(True, sums.weighted(lp.weight, W, -math.inf))
+
+
+def _measure(lp: StabilizationLP, policy: Pairs, mu: Floats) -> Found:
+    residual, holds = checks.check_measure(lp, policy, mu)
+    return Found(holds, residual)
+
+
+def _refusal(lp: StabilizationLP, policy: Pairs, w: Floats) -> Found:
+    return Found(checks.check_refusal(lp, w))
+
+
+def _not_stabilizing(lp: StabilizationLP, policy: Pairs | None, number: float | None) -> str:
+    lost = 0 if policy is None else int((~reaches_attractor(lp, policy)).sum())
+    if lost and lp.gamma < 1:
+        return (
+            f"from {lost} of {lp.n} cells the policy never reaches the attractor: at gamma = "
+            f"{lp.gamma!r} < 1 staying away can be cheaper than going; raise gamma to 1"
+        )
+    if lost:
+        return f"from {lost} of {lp.n} cells the policy never reaches the attractor"
+    return "no contraction of the policy could be proved: the numbers do not allow it"
+
+
+def _no_measure(lp: StabilizationLP, policy: Pairs | None, residual: float | None) -> str:
+    text = "the Lyapunov measure could not be established"
+    if residual is None:
+        return text
+    return (
+        f"{text}: its residual is {residual:.2g}, above 1e-9 of its size; the numbers no longer "
+        "allow it, lower gamma"
+    )
+
+
+STABILIZING = Claim(
+    "stabilizing", About.POLICY, "w", _stabilizing, exact_checks.stabilizing, _not_stabilizing,
+    "contraction",
+)  # fmt: skip
+UPPER_BOUND = Claim(
+    "upper_bound", About.POLICY, "V_up", _upper_bound, exact_checks.upper_bound,
+    lambda *_: "no upper bound on the cost of the policy could be established", "cost",
+)  # fmt: skip
+LOWER_BOUND = Claim(
+    "lower_bound", About.PAIRS, "W", _lower_bound, exact_checks.lower_bound,
+    lambda *_: "no lower bound on the optimal cost could be established", "lower",
+)  # fmt: skip
+MEASURE = Claim(
+    "measure", About.POLICY, "mu", _measure, exact_checks.measure, _no_measure,
+    "measure_residual",
+)  # fmt: skip
+REFUSAL = Claim(
+    "refusal", About.NO_POLICY, "w", _refusal, exact_checks.refusal,
+    lambda lp, *_: f"proved: no policy has finite cost at gamma = {lp.gamma!r}",
+)  # fmt: skip
+CLAIMS = (STABILIZING, UPPER_BOUND, LOWER_BOUND, MEASURE, REFUSAL)
+"""In the order of certificate.json."""
+
+
+def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
+    """Check every claim of a witness against the finite model.
+
+    Parameters
+    ----------
+    lp
+        The finite model.
+    witness
+        Policy and vectors; nothing in it is trusted.
+    tolerance
+        Largest gap that counts as verified.
+    """
+    policy, own = _policy(lp, witness), np.arange(lp.n)
+    under = lp if policy is None else lp.under(policy)
+
+    def judged(*claims: Claim) -> dict[str, Found]:
+        return {
+            claim.name: claim.check(under if claim.about is About.POLICY else lp, own, x)
+            for claim in claims
+            if (x := getattr(witness, claim.vector)) is not None
+        }
+
+    asked = _asked(policy)
+    first = [claim for claim in asked if claim.about is About.POLICY]
+    half = len(first) - len(first) // 2
+    found: dict[str, Found] = {}
+    for part in threads.both(
+        lambda: judged(*first[:half]), lambda: judged(*first[half:]), lp.n >= MANY
+    ):
+        found |= part
+    found |= judged(*(claim for claim in asked if claim not in first))
+    known = _held(found, UPPER_BOUND) and _held(found, LOWER_BOUND)
+    gap = checks.gap(lp, witness.V_up, witness.W) if known else None
+    return _certificate(lp, policy, found, gap, tolerance)
+
+
+def check_exactly(
+    lp: StabilizationLP, witness: Witness, tolerance: float, check: Check | None = None
+) -> Certificate:
+    """Check every claim of a witness in rational arithmetic.
+
+    Parameters
+    ----------
+    lp, witness, tolerance
+        As for :func:`check`; a claim that holds only with equality holds.
+    check
+        Called now and then; it may raise.
+    """
+    policy = _policy(lp, witness)
+    columns = np.empty(0, dtype=np.int64) if policy is None else policy
+    rows = [row for _, row in exact_sums.rows(lp, columns, check)]
+    model = exact_checks.ExactModel(lp, columns, rows, check)
+    vectors = {
+        name: exact_sums.fractions(x)
+        for name in {claim.vector for claim in CLAIMS}
+        if (x := getattr(witness, name)) is not None and checks.is_sound(lp, x)
+    }
+    found = {
+        claim.name: claim.check_exactly(model, vectors[claim.vector])
+        for claim in _asked(policy)
+        if claim.vector in vectors
+    }
+    known = _held(found, UPPER_BOUND) and _held(found, LOWER_BOUND)
+    gap = exact_checks.gap(lp, vectors["V_up"], vectors["W"]) if known else None
+    return _certificate(lp, policy, found, gap, tolerance)
+
+
+def _policy(lp: StabilizationLP, witness: Witness) -> Pairs | None:
+    policy = witness.policy
+    return policy if policy is not None and checks.is_policy(lp, policy) else None
+
+
+def _asked(policy: Pairs | None) -> list[Claim]:
+    other = About.NO_POLICY if policy is not None else About.POLICY
+    return [claim for claim in CLAIMS if claim.about is not other]
+
+
+def _held(found: Mapping[str, Found], claim: Claim) -> bool:
+    return found.get(claim.name, NOTHING).holds
+
+
+def _certificate(
+    lp: StabilizationLP,
+    policy: Pairs | None,
+    found: Mapping[str, Found],
+    gap: float | None,
+    tolerance: float,
+) -> Certificate:
+    """Return what was found, with the reasons why it is not verified."""
+    holds = {claim.name: _held(found, claim) for claim in CLAIMS}
+    numbers = {
+        claim.number: found.get(claim.name, NOTHING).number for claim in CLAIMS if claim.number
+    }
+    cost, lower = numbers["cost"], numbers["lower"]
+    if gap is not None and cost is not None and lower is not None:
+        gap = sums.stated_gap(gap, cost, lower)
+    reasons = []
+    if holds["refusal"]:
+        reasons.append(REFUSAL.sentence(lp, policy, None))
+    elif policy is None:
+        reasons.append("there is no policy to verify")
+    else:
+        reasons += [
+            claim.sentence(lp, policy, found.get(claim.name, NOTHING).number)
+            for claim in _asked(policy)
+            if not holds[claim.name]
+        ]
+        if gap is not None and gap > tolerance:
+            reasons.append(
+                f"the gap {gap:.3g} is above the tolerance {tolerance:.3g}" + _too_small(cost)
+            )
+    said: dict[str, Any] = {**holds, **numbers}
+    return Certificate(**said, gap=gap, tolerance=tolerance, reasons=tuple(reasons))
+
+
+def _too_small(cost: float | None) -> str:
+    if cost is None or not cost < sums.NORMAL:
+        return ""
+    return (
+        f": the cost {cost!r} is below the normal range of doubles, which are coarse there; "
+        "multiply stage_cost by a power of ten"
+    )
