@@ -21,7 +21,7 @@ from lmdsl.common.frozen import Frozen
 from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline
-from lmdsl.model.discretization import control_range, noise_nodes
+from lmdsl.model.discretization import control_range
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local import linearisation, riccati
 from lmdsl.model.true_map import TrueMap
@@ -89,51 +89,23 @@ class LocalController(Frozen):
         if declared is None:
             return None
         low, high = control_range(problem)
-        where = "local_controller"
-        p, d = len(low), partition.dimension
         if isinstance(declared, ConstantControl):
-            control = np.array([[declared.control.get(name, 0.0) for name in problem.controls]])
-            _within(control, low, high, problem.controls, where)
-            centre = (partition.low + partition.high)[None, :] / 2
-            gain = np.zeros((1, p, d))
-            return cls(partition, attractor, centre, control.reshape(1, p), gain, low, high, None)
-        orbit = np.array(
-            [
-                [point[name] for name in partition.names] if isinstance(point, dict) else point
-                for point in declared.orbit
-            ]
-        )
-        q = len(orbit)
-        control = np.zeros((q, p))
+            orbit = (partition.low + partition.high)[None, :] / 2
+        else:
+            orbit = linearisation.points(declared.orbit, partition)
+        control = np.zeros((len(orbit), len(low)))
         for j, name in enumerate(problem.controls):
             control[:, j] = declared.control.get(name, 0.0)
-        _within(control, low, high, problem.controls, where)
-        _inside(orbit, partition, attractor)
-        true_map = TrueMap(problem, partition)
-        noise = [np.full(q, mean) for mean in noise_nodes(problem).mean()]
-        check = partial(Deadline.of(deadline).check, "linearising along the orbit")
-        linearisation.refuse_unless_orbit(true_map, orbit, control, noise, check)
-        width, reach = partition.width, linearisation.reach(low, high, control)
-        unit = np.concatenate([width, reach])
-        jacobian = linearisation.jacobian(true_map, orbit, control, noise, unit, check)
-        A, B = jacobian[:, :, :d], jacobian[:, :, d:]
-        smooth = bool(np.isfinite(jacobian).all())
-        if isinstance(declared, LinearFeedback):
-            gain = np.zeros((q, p, d))
-            for j, u in enumerate(problem.controls):
-                for i, x in enumerate(partition.names):
-                    gain[:, j, i] = declared.gain.get(u, {}).get(x, 0.0)
-        elif not smooth:
-            raise BadInput("the system is not differentiable there", "local_controller.orbit")
-        else:
-            scaled = _regulator(A, B, declared, problem, width, reach)
-            gain = scaled * reach[:, None] / width
-        multiplier = None
-        if smooth:
-            product = np.eye(d)
-            for k in range(q):
-                product = (A[k] - B[k] @ (gain[k] / reach[:, None] * width)) @ product
-            multiplier = float(np.abs(np.linalg.eigvals(product)).max())
+        _within(control, low, high, problem.controls)
+        gain, multiplier = np.zeros((*control.shape, partition.dimension)), None
+        if not isinstance(declared, ConstantControl):
+            _inside(orbit, partition, attractor)
+            check = partial(Deadline.of(deadline).check, "linearising along the orbit")
+            reach = linearisation.reach(low, high, control)
+            true_map = TrueMap(problem, partition)
+            A, B = linearisation.along(true_map, orbit, control, reach, check)
+            gain = _gain(declared, problem, A, B, partition.width, reach)
+            multiplier = _multiplier(A, B, gain / reach[:, None] * partition.width)
         return cls(partition, attractor, orbit, control, gain, low, high, multiplier)
 
     def owner(self, cell: Indices) -> Indices:
@@ -193,14 +165,14 @@ class LocalController(Frozen):
         return distance
 
 
-def _within(control: Floats, low: Floats, high: Floats, names: tuple[str, ...], where: str) -> None:
+def _within(control: Floats, low: Floats, high: Floats, names: tuple[str, ...]) -> None:
     for j, name in enumerate(names):
         for u in control[:, j]:
             if not low[j] <= u <= high[j]:
                 raise BadInput(
                     f"{float(u)!r} is outside the control grid "
                     f"[{float(low[j])!r}, {float(high[j])!r}]",
-                    f"{where}.control.{name}",
+                    f"local_controller.control.{name}",
                 )
 
 
@@ -210,6 +182,36 @@ def _inside(orbit: Floats, partition: Partition, attractor: NDArray[np.bool_]) -
         block = partition.around_point([float(x) for x in point], where)
         if not attractor[partition.mask([block])].any():
             raise BadInput("the point lies in no attractor cell; add it to the attractor", where)
+
+
+def _gain(
+    declared: LinearFeedback | LqrFeedback,
+    problem: Problem,
+    A: Floats,
+    B: Floats,
+    width: Floats,
+    reach: Floats,
+) -> Floats:
+    """Return the feedback matrices, shape (q, p, d)."""
+    if isinstance(declared, LqrFeedback):
+        if not (np.isfinite(A).all() and np.isfinite(B).all()):
+            raise BadInput("the system is not differentiable there", "local_controller.orbit")
+        return _regulator(A, B, declared, problem, width, reach) * reach[:, None] / width
+    gain = np.zeros((len(A), len(reach), len(width)))
+    for j, u in enumerate(problem.controls):
+        for i, x in enumerate(problem.states):
+            gain[:, j, i] = declared.gain.get(u, {}).get(x, 0.0)
+    return gain
+
+
+def _multiplier(A: Floats, B: Floats, gain: Floats) -> float | None:
+    """Return the largest modulus of the multipliers, all in the units of A and B."""
+    if not (np.isfinite(A).all() and np.isfinite(B).all()):
+        return None
+    product = np.eye(A.shape[1])
+    for k in range(len(A)):
+        product = (A[k] - B[k] @ gain[k]) @ product
+    return float(np.abs(np.linalg.eigvals(product)).max())
 
 
 def _regulator(

@@ -2,21 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from lmdsl.common.types import Check, Floats
 from lmdsl.errors import BadInput
 from lmdsl.formulas.enclosures import Jet
 from lmdsl.formulas.intervals import Interval
+from lmdsl.model.discretization import noise_nodes
+from lmdsl.model.grid.partition import Partition
 from lmdsl.model.true_map import TrueMap
 
 ON_ORBIT = 1e-3  # cell widths by which a point may miss its successor
 
 
-def refuse_unless_orbit(
+def points(orbit: Sequence[Any], partition: Partition) -> Floats:
+    """Return the points of a declared orbit, shape (q, d)."""
+    return np.array(
+        [[x[name] for name in partition.names] if isinstance(x, dict) else x for x in orbit]
+    )
+
+
+def along(
+    true_map: TrueMap, orbit: Floats, control: Floats, reach: Floats, check: Check
+) -> tuple[Floats, Floats]:
+    """Return the derivatives along an orbit (q, d) under controls (q, p); NaN at a kink.
+
+    Returns
+    -------
+    A, B
+        By states, shape (q, d, d), and by controls, shape (q, d, p), per unit of each variable:
+        cell widths, and the reach of the controls.
+
+    Raises
+    ------
+    BadInput
+        The map does not send each point to the next.
+    """
+    noise = [np.full(len(orbit), mean) for mean in noise_nodes(true_map.problem).mean()]
+    _refuse_unless_orbit(true_map, orbit, control, noise, check)
+    unit, d = np.concatenate([true_map.partition.width, reach]), orbit.shape[1]
+    slopes = _jacobian(true_map, orbit, control, noise, unit, check)
+    return slopes[:, :, :d], slopes[:, :, d:]
+
+
+def _refuse_unless_orbit(
     true_map: TrueMap, orbit: Floats, control: Floats, noise: list[Floats], check: Check
 ) -> None:
-    """Refuse points (q, d) that the map, under controls (q, p), does not send one to the next."""
     images, partition = true_map.images(orbit, control, noise, check), true_map.partition
     with np.errstate(invalid="ignore"):
         miss = partition.deviation(images, np.roll(orbit, -1, axis=0))
@@ -37,7 +71,7 @@ def reach(low: Floats, high: Floats, control: Floats) -> Floats:
     return np.where(far > 0, far, 1.0)
 
 
-def jacobian(
+def _jacobian(
     true_map: TrueMap,
     orbit: Floats,
     control: Floats,
@@ -45,10 +79,7 @@ def jacobian(
     unit: Floats,
     check: Check,
 ) -> Floats:
-    """Return the derivatives by states and controls, shape (q, d, d + p); NaN at a kink.
-
-    They are per unit of each variable: cell widths, and the reach of the controls.
-    """
+    """Return the derivatives by states and controls, shape (q, d, d + p); NaN at a kink."""
     at, d = np.concatenate([orbit, control], axis=1), orbit.shape[1]
     jets = [Jet.variable(Interval.point(y), j, len(at.T)) for j, y in enumerate(at.T)]
     fixed = [Jet.constant(y, len(at.T)) for y in noise]
