@@ -168,7 +168,8 @@ def test_a_plot_that_does_not_fit_is_refused(monkeypatch, draw):
 
 PEAK = """
 import lmdsl as lm
-from lmdsl import memory, plotting
+from lmdsl import plotting
+from lmdsl.machine import memory
 
 def peak():
     lines = open("/proc/self/status").read().splitlines()
