@@ -33,9 +33,7 @@ def compact(lp: lm.StabilizationLP) -> list[NDArray[Any]]:
 
 def cold(lp: lm.StabilizationLP) -> lm.StabilizationLP:
     """Return the same LP without anything it remembers but what compiling hands over."""
-    fresh = replace(lp, rows=replace(lp.rows))
-    vars(fresh)["tree"] = lp.tree
-    return fresh
+    return replace(lp, rows=replace(lp.rows), _known=lp._algorithm_1)
 
 
 def improvement_sweep(lp: lm.StabilizationLP, V: NDArray[Any]) -> Callable[[], Any]:

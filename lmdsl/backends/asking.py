@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from lmdsl import backends
 from lmdsl.backends import Backend, Options, Solution, Stop
+from lmdsl.backends.policy_iteration import Iterated
 from lmdsl.backends.scaled import failure
 from lmdsl.common.frozen import freeze
 from lmdsl.common.types import Pairs
@@ -78,7 +79,7 @@ def _ask(
                     os._exit(1)
                 restore_rounding("the backend")
             solution = _plain(asked, found)
-            iteration = found.details.get("iteration") if own else None
+            iteration = found.iteration if own and isinstance(found, Iterated) else None
     except BadInput as refusal:
         if own:
             raise

@@ -8,12 +8,24 @@ and with zeros in the cost; for gamma >= 1 every policy on the way is gamma-stab
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility import first_policy
 from lmdsl.optimize.policies import evaluation, iteration
+from lmdsl.optimize.policies.iteration import Iteration
+
+
+@dataclass(frozen=True, eq=False)
+class Iterated(Solution):
+    """A solution with the last step of policy iteration, where polishing would begin.
+
+    It is believed of our own backends only.
+    """
+
+    iteration: Iteration | None = None
 
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:
@@ -45,9 +57,8 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     stop = Stop.OPTIMAL
     if not done.converged:
         stop = Stop.TIME_LIMIT if late() else Stop.ITERATION_LIMIT
-    return Solution(
-        stop, stop.name.lower(), done.value, None, done.policy, done.steps, {"iteration": done}
-    )
+    word = stop.name.lower()
+    return Iterated(stop, word, done.value, None, done.policy, done.steps, iteration=done)
 
 
 BACKEND = Backend(

@@ -29,7 +29,7 @@ class About(Enum):
     NO_POLICY = "all surviving pairs, where there is no policy"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Claim:
     """A claim: an inequality between stored doubles (see claims.py).
 

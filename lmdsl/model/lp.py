@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import InitVar, dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,9 @@ from lmdsl.model.rows import Rows
 from lmdsl.model.sets import Regions
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
+
+Levels = tuple[NDArray[np.int32], NDArray[np.int64]]
+"""Level and first stabilizing column of every cell."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +83,12 @@ class StabilizationLP(Frozen):
     cost: Floats
     gamma: float
     weight: Floats
+    _known: InitVar[Levels | None] = None
+    _levels: ClassVar[Levels | None] = None
+
+    def __post_init__(self, _known: Levels | None) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "_levels", _known)  # of these pairs: no copy takes it over
 
     @property
     def n(self) -> int:
@@ -194,9 +203,9 @@ class StabilizationLP(Frozen):
         return level, policy
 
     @cached_property
-    def _algorithm_1(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    def _algorithm_1(self) -> Levels:
         """The same as our own code reads it: compiled loops tell read-only arrays from others."""
-        return algorithm_1.tree(self.pair_pointer, self.rows)
+        return self._levels or algorithm_1.tree(self.pair_pointer, self.rows)
 
     @property
     def kernel(self) -> tuple[NDArray[Any], ...]:
@@ -301,6 +310,9 @@ def compile(  # noqa: A001
     status[regions.free] = stabilizable_set.causes(found, transitions.pair_pointer)
     status[regions.attractor] = CellStatus.ATTRACTOR
     cells = regions.free[found.inside]
+    # The search that found C ends with Algorithm 1 on the surviving pairs.
+    policy = found.pair[found.inside]
+    column = policy if isinstance(kept, slice) else np.searchsorted(kept, policy)
     lp = StabilizationLP(
         problem=problem,
         partition=partition,
@@ -313,12 +325,9 @@ def compile(  # noqa: A001
         cost=transitions.cost[kept],
         gamma=problem.gamma,
         weight=regions.weight(cells),
+        _known=(found.level[found.inside], column),
     )
     for array in (lp.controls, lp.control, lp.cost):  # views
         if isinstance(array.base, np.ndarray):
             freeze(array.base)
-    # The search that found C ends with Algorithm 1 on the surviving pairs.
-    policy = found.pair[found.inside]
-    column = policy if isinstance(kept, slice) else np.searchsorted(kept, policy)
-    vars(lp)["_algorithm_1"] = found.level[found.inside], column
     return lp

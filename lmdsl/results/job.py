@@ -65,13 +65,12 @@ class _Job:
     def __init__(
         self,
         lp: StabilizationLP,
-        backend: Backend,
+        backend: str,
         tolerance: float,
         compile_seconds: float | None,
-        spec: str | None,
     ) -> None:
-        self.lp, self.tolerance, self.compile_seconds = lp, tolerance, compile_seconds
-        self.backend = spec or backend.name
+        self.lp, self.backend, self.tolerance = lp, backend, tolerance
+        self.compile_seconds = compile_seconds
         self.finish = Deadline()
         self.solve_seconds: float | None = None
         self.verify_seconds: float | None = None

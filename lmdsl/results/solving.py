@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from lmdsl.optimize.feasibility import first_policy, gamma_bar, restriction
 from lmdsl.optimize.witness import certify
 from lmdsl.problem.problem import Problem
 from lmdsl.results.job import _Job, not_compiled
-from lmdsl.results.polishing import _polish
+from lmdsl.results.polishing import _Outcome, _polish
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause
 
@@ -81,77 +82,118 @@ def solve(
     _check_options(problem, tolerance, max_iterations)
     require_all = inputs.flag(require_all, "require_all")
     restrict_to_gamma = inputs.flag(restrict_to_gamma, "restrict_to_gamma")
-    late = Deadline.of(time_limit)
     chosen, algorithm = backends.resolve(backend)
+    wishes = _Wishes(
+        backend=chosen,
+        algorithm=algorithm,
+        name=backend if isinstance(backend, str) else chosen.name,
+        tolerance=tolerance,
+        late=Deadline.of(time_limit),
+        max_iterations=max_iterations,
+        require_all=require_all,
+        restrict_to_gamma=restrict_to_gamma,
+        progress=progress,
+    )
+    if isinstance(problem, StabilizationLP):
+        return _answer(problem, wishes)
     started = time.perf_counter()
-    compiled = None
-    if isinstance(problem, Problem):
-        try:
-            lp = compile(problem, progress, late)
-        except TimeLimitReached as error:
-            return not_compiled(backend, problem, tolerance, error, time.perf_counter() - started)
-        compiled = time.perf_counter() - started
-    else:
-        lp = problem
-    job = _Job(lp, chosen, tolerance, compiled, backend if isinstance(backend, str) else None)
-    refused = _not_stabilizable(lp, require_all)
+    try:
+        lp = compile(problem, progress, wishes.late)
+    except TimeLimitReached as error:
+        return not_compiled(backend, problem, tolerance, error, time.perf_counter() - started)
+    return _answer(lp, wishes, time.perf_counter() - started)
+
+
+@dataclass(frozen=True)
+class _Wishes:
+    """What the caller of :func:`solve` asks for; ``late`` tells when the time is up."""
+
+    backend: Backend
+    algorithm: str | None
+    name: str
+    tolerance: float
+    late: Deadline
+    max_iterations: int | None
+    require_all: bool
+    restrict_to_gamma: bool
+    progress: Progress | None
+
+    def tell(self, stage: str) -> None:
+        """Tell the caller what begins."""
+        if self.progress:
+            self.progress(stage, -1.0)
+
+
+def _answer(lp: StabilizationLP, wishes: _Wishes, compile_seconds: float | None = None) -> Result:
+    """Find a policy of a compiled problem, and the proof of it or against any."""
+    late = wishes.late
+    job = _Job(lp, wishes.name, wishes.tolerance, compile_seconds)
+    refused = _not_stabilizable(lp, wishes.require_all)
     job.finish = late.again()
     if refused:
         return job.refused(*refused)
     started = time.perf_counter()
     first = first_policy.stabilizing(lp, late)
     if isinstance(first, first_policy.Refused):
-        verified = _refuse(lp, first, tolerance)
-        w = verified.witness.w
-        if verified.certificate.refusal and w is not None:
-            smaller = restriction.restricted(lp, w) if restrict_to_gamma else None
-            if smaller is not None:
-                inner = solve(
-                    smaller,
-                    backend,
-                    tolerance=tolerance,
-                    time_limit=late,
-                    max_iterations=max_iterations,
-                    require_all=require_all,
-                    restrict_to_gamma=True,
-                    progress=progress,
-                )
-                return job.restricted(inner, lp.expand(w, 0.0, 0.0))
-            job.solve_seconds, job.finish = time.perf_counter() - started, late.again()
-            limits = gamma_bar.bracket(lp, late, start=first.best)
-            bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
-            message = restriction.refusal_message(lp, w, limits, bracket)
-            return job.refused(Cause.GAMMA, message, verified, bracket)
+        infeasible = _infeasible(lp, first, wishes, job, started)
+        if infeasible is not None:
+            return infeasible
         first = first_policy.Undecided(first.best.policy, first.lower)
-    options = Options(
-        tolerance=tolerance,
-        time_limit=late.left,
-        max_iterations=max_iterations,
-        algorithm=algorithm,
-        start=first.policy,
-        proof=first.w if isinstance(first, first_policy.Feasible) else None,
-        progress=progress,
-    )
-    iteration = None
+    solution, outcome = _asked(lp, first, wishes, job)
+    job.solve_seconds = time.perf_counter() - started
+    wishes.tell("verify")
+    started = time.perf_counter()
+    job.finish = late.again()
+    verified = certify(lp, outcome.policy, wishes.tolerance, outcome.value, job.finish)
+    job.verify_seconds = time.perf_counter() - started
+    undecided = isinstance(first, first_policy.Undecided) and not late()
+    return job.solved(solution, outcome, verified, undecided)
+
+
+def _infeasible(
+    lp: StabilizationLP, first: first_policy.Refused, wishes: _Wishes, job: _Job, started: float
+) -> Result | None:
+    """Return the refusal of gamma, or the answer on the other cells; None if it is not proved."""
+    verified = _refuse(lp, first, wishes.tolerance)
+    w = verified.witness.w
+    if not verified.certificate.refusal or w is None:
+        return None
+    smaller = restriction.restricted(lp, w) if wishes.restrict_to_gamma else None
+    if smaller is not None:
+        return job.restricted(_answer(smaller, wishes), lp.expand(w, 0.0, 0.0))
+    job.solve_seconds, job.finish = time.perf_counter() - started, wishes.late.again()
+    limits = gamma_bar.bracket(lp, wishes.late, start=first.best)
+    bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
+    message = restriction.refusal_message(lp, w, limits, bracket)
+    return job.refused(Cause.GAMMA, message, verified, bracket)
+
+
+def _asked(
+    lp: StabilizationLP,
+    first: first_policy.Feasible | first_policy.Undecided,
+    wishes: _Wishes,
+    job: _Job,
+) -> tuple[Solution, _Outcome]:
+    """Return what the backend says, and its policy polished; it is not asked where undecided."""
+    late, iteration = wishes.late, None
     if isinstance(first, first_policy.Undecided):
         word = "time limit" if late() else "undecided"
         stop = Stop.TIME_LIMIT if late() else Stop.FAILED
         solution = Solution(stop, word, policy=first.policy)
     else:
-        if progress:
-            progress("solve", -1.0)
-        solution, iteration, job.log = ask(lp, chosen, options)
-    outcome = _polish(lp, solution, iteration, first.policy, tolerance, late)
-    iteration = None  # the rows of its last policy would stay till the end
-    job.solve_seconds = time.perf_counter() - started
-    if progress:
-        progress("verify", -1.0)
-    started = time.perf_counter()
-    job.finish = late.again()
-    verified = certify(lp, outcome.policy, tolerance, outcome.value, job.finish)
-    job.verify_seconds = time.perf_counter() - started
-    undecided = isinstance(first, first_policy.Undecided) and not late()
-    return job.solved(solution, outcome, verified, undecided)
+        options = Options(
+            tolerance=wishes.tolerance,
+            time_limit=late.left,
+            max_iterations=wishes.max_iterations,
+            algorithm=wishes.algorithm,
+            start=first.policy,
+            proof=first.w,
+            progress=wishes.progress,
+        )
+        wishes.tell("solve")
+        solution, iteration, job.log = ask(lp, wishes.backend, options)
+    outcome = _polish(lp, solution, iteration, first.policy, wishes.tolerance, late)
+    return solution, outcome
 
 
 def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:

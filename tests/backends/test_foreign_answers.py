@@ -13,6 +13,7 @@ from foreign_backends import Unspeakable, asked, foreign, optimal
 
 import lmdsl as lm
 from lmdsl.backends import Solution, Stop
+from lmdsl.backends.policy_iteration import Iterated
 from lmdsl.optimize.policies import evaluation, iteration
 from lmdsl.optimize.policies.iteration import Iteration
 
@@ -225,13 +226,16 @@ def test_a_stop_is_a_stop(lp, stop):
     assert asked(lp, lambda lp, o: Solution(stop, "optimal")).stop is Stop.FAILED
 
 
-def test_details_prove_nothing(lp, truth):
+@pytest.mark.parametrize("typed", [False, True])
+def test_details_prove_nothing(lp, truth, typed):
     # What our own policy iteration hands on must not be forged: here a policy that is not optimal.
     def forger(lp, options):
         pair = lp.tree[1]
         value = evaluation.evaluate(lp, pair)
         screen = iteration.Screen(lp)
         claim = Iteration(pair, value, 0, True, screen)
+        if typed:
+            return Iterated(Stop.OPTIMAL, "optimal", value, None, pair, 1, iteration=claim)
         return Solution(Stop.OPTIMAL, "optimal", value, None, pair, 1, {"iteration": claim})
 
     assert (lp.tree[1] != truth.lp.column(0, 0)).any()

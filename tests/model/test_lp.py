@@ -195,6 +195,18 @@ def test_levels_by_sweeps_and_by_search_are_the_same(patience, monkeypatch):
         np.testing.assert_array_equal(found[1], first)
 
 
+@pytest.mark.parametrize("data", [steps(), standard_map(12)])
+def test_no_copy_takes_over_what_was_known_of_other_pairs(data):
+    lp = lm.compile(made(data))
+    for copied in (replace(lp), lp.part(np.arange(lp.K), np.arange(lp.n))):
+        for known, found in zip(lp.tree, copied.tree, strict=True):
+            np.testing.assert_array_equal(known, found)
+    last = lp.under(lp.pair_pointer[1:] - 1)
+    found = tree(last.pair_pointer, last.rows)
+    for known, true in zip(last.tree, found, strict=True):
+        np.testing.assert_array_equal(known, true)
+
+
 def test_tree_levels_are_distances():
     lp = lm.compile(made(steps()))
     level, pair = lp.tree
