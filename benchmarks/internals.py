@@ -16,6 +16,7 @@ from lmdsl.model.discretization import Nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.rows import Rows, Shares
 from lmdsl.optimize import witness
+from lmdsl.optimize.linear.policy_system import of_policy
 from lmdsl.optimize.policies import bellman
 from lmdsl.optimize.policies.evaluation import evaluate
 
@@ -41,21 +42,21 @@ def improvement_sweep(lp: lm.StabilizationLP, V: NDArray[Any]) -> Callable[[], A
     return lambda: bellman.improve(lp, V)
 
 
-def evaluation_sweep(lp: lm.StabilizationLP, pair: NDArray[Any]) -> Callable[[], Any]:
+def evaluation_sweep(lp: lm.StabilizationLP, policy: NDArray[Any]) -> Callable[[], Any]:
     """Return one evaluation sweep over the rows of a policy."""
-    system, b = lp.rows.system(pair, lp.gamma, lp.directions), lp.cost[pair]
+    system, b = of_policy(lp, policy, lp.gamma), lp.cost[policy]
     x = b.copy()
     return lambda: system.sweep(b, x, 1)
 
 
-def evaluation(lp: lm.StabilizationLP, pair: NDArray[Any]) -> Callable[[], Any]:
+def evaluation(lp: lm.StabilizationLP, policy: NDArray[Any]) -> Callable[[], Any]:
     """Return the whole evaluation of a policy, from nothing to its value."""
-    return lambda: evaluate(lp, pair)
+    return lambda: evaluate(lp, policy)
 
 
-def certificate(lp: lm.StabilizationLP, pair: NDArray[Any], V: NDArray[Any]) -> Callable[[], Any]:
+def certificate(lp: lm.StabilizationLP, policy: NDArray[Any], V: NDArray[Any]) -> Callable[[], Any]:
     """Return the making and checking of a certificate."""
-    return lambda: witness.certify(lp, pair, 1e-6, V)
+    return lambda: witness.certify(lp, policy, 1e-6, V)
 
 
 @contextlib.contextmanager

@@ -90,7 +90,7 @@ def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None)
 
     def part(cells: tuple[int, int]) -> tuple[int, Pairs]:
         found = np.empty(MAX_EXACT, dtype=np.int64)
-        given = (*cells, *lp.kernel, gamma, cost, V)
+        given = (*cells, *lp._kernel, gamma, cost, V)
         count, _, _ = _open(*given, found) if plain else _carefully(*given, NO_BOUNDS, found)
         return int(count), found[:count].copy()
 
@@ -142,7 +142,7 @@ def worst_excess(lp: StabilizationLP, V: Floats) -> tuple[float, bool]:
     x, plain = padded(V), tame(lp, V, lp.gamma)
 
     def part(cells: tuple[int, int]) -> tuple[float, bool]:
-        given = (*cells, *lp.kernel, lp.gamma, lp.cost, x)
+        given = (*cells, *lp._kernel, lp.gamma, lp.cost, x)
         room = (NO_PAIRS,) if plain else (NO_BOUNDS, NO_PAIRS)
         _, worst, stuck = (_open if plain else _carefully)(*given, *room)
         return float(worst), bool(stuck)

@@ -154,7 +154,7 @@ class ClosedLoop:
         self.probability = self.nodes.weights / self.nodes.weights.sum()
 
     def step(
-        self, x: Floats, cell: Indices, rng: np.random.Generator, late: Deadline = FOREVER
+        self, x: Floats, cell: Indices, rng: np.random.Generator, deadline: Deadline = FOREVER
     ) -> tuple[Floats, Indices]:
         """Return the next states, shape (r, d), and their cells, -1 outside the box.
 
@@ -168,10 +168,10 @@ class ClosedLoop:
         if self.problem.noises:
             node = rng.choice(len(self.probability), size=len(x), p=self.probability)
             noise = list(self.nodes.values[node].T)
-        return self.true_map.step(x, u, noise, partial(late.check, "simulating"))
+        return self.true_map.step(x, u, noise, partial(deadline.check, "simulating"))
 
     def run(
-        self, x: Floats, steps: int, rng: np.random.Generator, late: Deadline = FOREVER
+        self, x: Floats, steps: int, rng: np.random.Generator, deadline: Deadline = FOREVER
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
         """Run from states until A, loss, the step limit, or the deadline.
 
@@ -200,16 +200,16 @@ class ClosedLoop:
             on = state == CellStatus.STABILIZED
             active, x, cell = active[on], x[on], cell[on]
             taken[active] = n
-            if n == steps or not len(active) or late():
+            if n == steps or not len(active) or deadline():
                 break
             try:
-                x, cell = self.step(x, cell, rng, late)
+                x, cell = self.step(x, cell, rng, deadline)
             except TimeLimitReached:
                 break
         return outcome, taken, np.concatenate(arrived)
 
     def hold(
-        self, x: Floats, steps: int, rng: np.random.Generator, late: Deadline = FOREVER
+        self, x: Floats, steps: int, rng: np.random.Generator, deadline: Deadline = FOREVER
     ) -> Held:
         """Run on from states of A, under the local controller inside A and the other outside."""
         local = self.controller.local
@@ -219,7 +219,7 @@ class ClosedLoop:
         stayed = np.ones(runs, dtype=np.bool_)
         for n in range(steps):
             try:
-                x, cell = self.step(x, cell, rng, late)
+                x, cell = self.step(x, cell, rng, deadline)
             except TimeLimitReached:
                 steps = n
                 break
@@ -276,7 +276,7 @@ def simulate(
     steps: int,
     seed: int,
     hold: int,
-    late: Deadline,
+    deadline: Deadline,
 ) -> Simulation:
     """Simulate closed-loop runs from random starts.
 
@@ -290,7 +290,7 @@ def simulate(
         Number of runs, step limit, seed of starts and noise.
     hold
         Steps to run on after the first entry into A, where there is a local controller.
-    late
+    deadline
         When to stop: the runs that have not ended by then count as cycling.
     """
     # States, images and their cells, controls, noise, and the arrays of the formulas.
@@ -300,7 +300,7 @@ def simulate(
     if not len(cells) or not weight.any():
         raise BadInput("there is no stabilizable cell to start from")
     x = draw_starts(loop.partition, cells, weight, starts, rng)
-    outcome, taken, arrived = loop.run(x, steps, rng, late)
+    outcome, taken, arrived = loop.run(x, steps, rng, deadline)
     reached = int((outcome == REACHED).sum())
     made = int(taken.max())
     cycling = int((outcome == CYCLING).sum())
@@ -315,7 +315,7 @@ def simulate(
         cycling=cycling,
         steps=quantiles,
         interval=clopper_pearson(reached, starts),
-        held=None if loop.controller.local is None else loop.hold(arrived, hold, rng, late),
+        held=None if loop.controller.local is None else loop.hold(arrived, hold, rng, deadline),
         steps_made=made,
         cut=bool(cycling) and made < steps,
     )

@@ -208,17 +208,17 @@ class StabilizationLP(Frozen):
         return self._levels or algorithm_1.tree(self.pair_pointer, self.rows)
 
     @property
-    def kernel(self) -> tuple[NDArray[Any], ...]:
+    def _kernel(self) -> tuple[NDArray[Any], ...]:
         """The pairs of every cell and their rows as compiled loops read them."""
         return self.pair_pointer.view(np.uint64), *self.rows.kernel
 
     @cached_property
-    def directions(self) -> Directions:
+    def _directions(self) -> Directions:
         """Orders in which sweeps visit the cells."""
         return Directions(self.cells, self.partition.shape)
 
     @cached_property
-    def predecessors(self) -> Predecessors:
+    def _predecessors(self) -> Predecessors:
         """Columns that can reach each cell."""
         return Predecessors.of(self.rows)
 

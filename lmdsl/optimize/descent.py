@@ -34,7 +34,7 @@ def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | No
     cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
 
     def part(cells: tuple[int, int]) -> None:
-        given = (*cells, *lp.kernel, gamma, cost, V, lower)
+        given = (*cells, *lp._kernel, gamma, cost, V, lower)
         if plain:
             _below(*given)
         else:

@@ -225,8 +225,8 @@ class Result(Report):
             raise BadInput("there is no controller to simulate: " + self.message)
         cells = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
         weight = self.weight[cells]
-        late = Deadline.of(time_limit)
-        return simulate(self.closed_loop, cells, weight, starts, steps, seed, hold, late)
+        deadline = Deadline.of(time_limit)
+        return simulate(self.closed_loop, cells, weight, starts, steps, seed, hold, deadline)
 
     @own_arithmetic
     def save(self, path: str | os.PathLike[str]) -> None:

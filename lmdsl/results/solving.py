@@ -88,7 +88,7 @@ def solve(
         algorithm=algorithm,
         name=backend if isinstance(backend, str) else chosen.name,
         tolerance=tolerance,
-        late=Deadline.of(time_limit),
+        deadline=Deadline.of(time_limit),
         max_iterations=max_iterations,
         require_all=require_all,
         restrict_to_gamma=restrict_to_gamma,
@@ -98,7 +98,7 @@ def solve(
         return _answer(problem, wishes)
     started = time.perf_counter()
     try:
-        lp = compile(problem, progress, wishes.late)
+        lp = compile(problem, progress, wishes.deadline)
     except TimeLimitReached as error:
         return not_compiled(backend, problem, tolerance, error, time.perf_counter() - started)
     return _answer(lp, wishes, time.perf_counter() - started)
@@ -112,7 +112,7 @@ class _Wishes:
     algorithm: str | None
     name: str
     tolerance: float
-    late: Deadline
+    deadline: Deadline
     max_iterations: int | None
     require_all: bool
     restrict_to_gamma: bool
@@ -126,14 +126,14 @@ class _Wishes:
 
 def _answer(lp: StabilizationLP, wishes: _Wishes, compile_seconds: float | None = None) -> Result:
     """Find a policy of a compiled problem, and the proof of it or against any."""
-    late = wishes.late
+    deadline = wishes.deadline
     job = _Job(lp, wishes.name, wishes.tolerance, compile_seconds)
     refused = _not_stabilizable(lp, wishes.require_all)
-    job.finish = late.again()
+    job.finish = deadline.again()
     if refused:
         return job.refused(*refused)
     started = time.perf_counter()
-    first = first_policy.stabilizing(lp, late)
+    first = first_policy.stabilizing(lp, deadline)
     if isinstance(first, first_policy.Refused):
         infeasible = _infeasible(lp, first, wishes, job, started)
         if infeasible is not None:
@@ -143,10 +143,10 @@ def _answer(lp: StabilizationLP, wishes: _Wishes, compile_seconds: float | None 
     job.solve_seconds = time.perf_counter() - started
     wishes.tell("verify")
     started = time.perf_counter()
-    job.finish = late.again()
+    job.finish = deadline.again()
     verified = certify(lp, outcome.policy, wishes.tolerance, outcome.value, job.finish)
     job.verify_seconds = time.perf_counter() - started
-    undecided = isinstance(first, first_policy.Undecided) and not late()
+    undecided = isinstance(first, first_policy.Undecided) and not deadline()
     return job.solved(solution, outcome, verified, undecided)
 
 
@@ -161,8 +161,8 @@ def _infeasible(
     smaller = restriction.restricted(lp, w) if wishes.restrict_to_gamma else None
     if smaller is not None:
         return job.restricted(_answer(smaller, wishes), lp.expand(w, 0.0, 0.0))
-    job.solve_seconds, job.finish = time.perf_counter() - started, wishes.late.again()
-    limits = gamma_bar.bracket(lp, wishes.late, start=first.best)
+    job.solve_seconds, job.finish = time.perf_counter() - started, wishes.deadline.again()
+    limits = gamma_bar.bracket(lp, wishes.deadline, start=first.best)
     bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
     message = restriction.refusal_message(lp, w, limits, bracket)
     return job.refused(Cause.GAMMA, message, verified, bracket)
@@ -175,15 +175,15 @@ def _asked(
     job: _Job,
 ) -> tuple[Solution, _Outcome]:
     """Return what the backend says, and its policy polished; it is not asked where undecided."""
-    late, iteration = wishes.late, None
+    deadline, iteration = wishes.deadline, None
     if isinstance(first, first_policy.Undecided):
-        word = "time limit" if late() else "undecided"
-        stop = Stop.TIME_LIMIT if late() else Stop.FAILED
+        word = "time limit" if deadline() else "undecided"
+        stop = Stop.TIME_LIMIT if deadline() else Stop.FAILED
         solution = Solution(stop, word, policy=first.policy)
     else:
         options = Options(
             tolerance=wishes.tolerance,
-            time_limit=late.left,
+            time_limit=deadline.left,
             max_iterations=wishes.max_iterations,
             algorithm=wishes.algorithm,
             start=first.policy,
@@ -192,7 +192,7 @@ def _asked(
         )
         wishes.tell("solve")
         solution, iteration, job.log = ask(lp, wishes.backend, options)
-    outcome = _polish(lp, solution, iteration, first.policy, wishes.tolerance, late)
+    outcome = _polish(lp, solution, iteration, first.policy, wishes.tolerance, deadline)
     return solution, outcome
 
 

@@ -125,8 +125,8 @@ def verify(
     BadInput
         The directory cannot be read.
     """
-    late = Deadline.of(time_limit)
-    in_time = partial(late.check, "verifying")
+    deadline = Deadline.of(time_limit)
+    in_time = partial(deadline.check, "verifying")
     exactly = partial(check_exactly, check=in_time)
     judge = exactly if inputs.flag(exact, "exact") else check
     path = inputs.path(path)
@@ -136,7 +136,7 @@ def verify(
         f"{name} was written anew since the save; what it holds now was judged"
         for name in held.rewritten
     ]
-    lp = whole = recompiled(path, result, progress, late)
+    lp = whole = recompiled(path, result, progress, deadline)
     in_time()
     if isinstance(result.problem.system, FunctionSystem):
         reasons += function_differences(lp, result)
@@ -160,7 +160,7 @@ def verify(
             reasons.append(f"the status is {result.status}, not verified")
     reasons += differences(whole, lp, result, held.certificate, certificate)
     in_time()
-    reasons += local_differences(lp, result, held.certificate, late)
+    reasons += local_differences(lp, result, held.certificate, deadline)
     return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
 
 

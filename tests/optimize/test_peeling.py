@@ -215,7 +215,7 @@ def test_slots_hold_the_rows_of_the_last_policy(monkeypatch, seed):
     lp = random_lp(rng, 20, 5, gamma=0.9)
     if seed % 2:
         monkeypatch.setattr(rows, "MANY", 1)  # in several ranges
-    P, slots = dense(lp), Slots.of(lp.rows, lp.pair_pointer, lp.gamma, lp.directions)
+    P, slots = dense(lp), Slots.of(lp.rows, lp.pair_pointer, lp.gamma, lp._directions)
     pair = lp.pair_pointer[:-1].copy()
     for _ in range(6):
         system = slots.system(pair)

@@ -8,7 +8,7 @@ import pytest
 from contestants import ROOT
 
 import lmdsl as lm
-from benchmarks import measure, models, pipeline, report, rivals, targets
+from benchmarks import internals, measure, models, pipeline, report, rivals, targets
 from benchmarks import run as running
 from benchmarks.arrays import Arrays
 
@@ -219,3 +219,19 @@ def test_the_boost_converter_is_absorbed_by_chance_alone():
 
 def test_a_target_that_could_not_be_measured_is_not_met(monkeypatch):
     assert True not in verdicts(monkeypatch, True, None).values()
+
+
+def test_the_single_steps_of_the_micro_benchmarks_run():
+    lp = models.get("standard-map-8").compiled()
+    result = lm.solve(lp)
+    V = result.value[lp.cells]
+    policy = lp.pair_pointer[:-1] + np.array(
+        [
+            np.flatnonzero(lp.control[a:b] == result.control_index[cell])[0]
+            for a, b, cell in zip(lp.pair_pointer, lp.pair_pointer[1:], lp.cells, strict=False)
+        ]
+    )
+    np.testing.assert_allclose(internals.evaluation(lp, policy)(), V, rtol=1e-9)
+    internals.evaluation_sweep(lp, policy)()
+    assert (internals.improvement_sweep(lp, V)().value <= V * (1 + 1e-9)).all()
+    assert internals.certificate(lp, policy, V)().certificate.verified

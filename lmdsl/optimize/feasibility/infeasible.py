@@ -36,7 +36,7 @@ def check_high(lp: StabilizationLP, w: Floats) -> float | None:
 
 def exhausted_by_levels(lp: StabilizationLP) -> Pairs | None:
     """Return a policy that reaches A within n steps surely, None where there is none."""
-    before = lp.predecessors
+    before = lp._predecessors
     policy = np.full(lp.n, -1, dtype=np.int64)
     _sure_levels(before.pointer, before.pair, lp.rows.pointer, lp.rows.target, lp.cell, policy)
     return policy if (policy >= 0).all() else None

@@ -117,7 +117,7 @@ def of_policy(
     slowest = float(rate[order[ends[lengths == 1] - 1]].max(initial=0.0))
     for k in several[np.argsort(lengths[several], kind="stable")]:
         cells = np.sort(order[ends[k] - lengths[k] : ends[k]])
-        directions = lp.directions.among(cells) if len(cells) >= equations.KRYLOV else None
+        directions = lp._directions.among(cells) if len(cells) >= equations.KRYLOV else None
         begin = None if start is None else start[cells]
         x[cells], rate[cells], least = _perron(
             P[cells][:, cells], stop, slowest, directions, begin, enough

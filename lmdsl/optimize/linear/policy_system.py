@@ -127,4 +127,4 @@ def of_policy(lp: StabilizationLP, policy: Pairs, gamma: float) -> System:
     """Return gamma P_u for a policy, ready for sweeps."""
     rows = lp.rows
     capacity = rows.pointer[policy + 1] - rows.pointer[policy]
-    return Slots(rows, capacity, gamma, lp.directions).system(policy)
+    return Slots(rows, capacity, gamma, lp._directions).system(policy)

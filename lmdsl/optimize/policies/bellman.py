@@ -57,7 +57,7 @@ def improve(
 
     def part(cells: tuple[int, int]) -> None:
         _improve(
-            *cells, *lp.kernel,
+            *cells, *lp._kernel,
             cost, gamma, x, value, policy,
         )  # fmt: skip
 
@@ -82,7 +82,7 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
 
     def part(cells: tuple[int, int]) -> None:
         _rise(
-            *cells, *lp.kernel,
+            *cells, *lp._kernel,
             gamma, x.copy(), backwards, value, policy,  # the others keep the values from before
         )  # fmt: skip
 
@@ -96,7 +96,7 @@ def below(lp: StabilizationLP, V: Floats, limit: Floats) -> NDArray[np.bool_]:
 
     def part(cells: tuple[int, int]) -> None:
         _below(
-            *cells, *lp.kernel,
+            *cells, *lp._kernel,
             lp.cost, lp.gamma, x, limit, found,
         )  # fmt: skip
 

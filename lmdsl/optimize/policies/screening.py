@@ -84,7 +84,7 @@ class Screen:
     def slots(self) -> Slots:
         """Room for the rows of the policy."""
         lp = self.lp
-        return Slots.of(lp.rows, lp.pair_pointer, self.gamma, lp.directions)
+        return Slots.of(lp.rows, lp.pair_pointer, self.gamma, lp._directions)
 
     def improve(self, V: Floats, policy: Pairs, margin: float) -> Pass:
         """Change a control where another one is better by more than a relative margin.
@@ -108,7 +108,7 @@ class Screen:
 
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(
-                *cells, lp.kernel[0], self.cost, x.copy(), own, margin, self.scale, backwards,
+                *cells, lp._kernel[0], self.cost, x.copy(), own, margin, self.scale, backwards,
                 self.rival, value, new.view(np.uint64), self.policy_cost, *slots,
             )  # fmt: skip
             return int(changed), int(looked)
@@ -144,7 +144,7 @@ class Screen:
 
         def part(cells: tuple[int, int]) -> bool:
             several = _ties(
-                *cells, *lp.kernel,
+                *cells, *lp._kernel,
                 self.cost, self.gamma, x, tolerance, self.scale, rival, own, ties,
                 first, np.empty(most),
             )  # fmt: skip

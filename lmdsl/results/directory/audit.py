@@ -180,7 +180,7 @@ def _bracket(whole: StabilizationLP, result: Result, found: Certificate) -> list
 
 
 def local_differences(
-    lp: StabilizationLP, result: Result, certificate: CertificateFile, late: Deadline
+    lp: StabilizationLP, result: Result, certificate: CertificateFile, deadline: Deadline
 ) -> list[str]:
     """Return where the local controller does less than the directory says."""
     stored, problem = result.local_controller, result.problem
@@ -199,10 +199,10 @@ def local_differences(
         cells, kind = int(attractor.sum()), problem.local_controller.kind
         found = LocalCheck(kind, stored.multiplier, cells, None, samples, kept)
     else:
-        local = LocalController.of(problem, lp.partition, attractor, late)
+        local = LocalController.of(problem, lp.partition, attractor, deadline)
         assert local is not None
-        found = check_local(problem, local, late, samples=samples)
-        late.check("verifying")  # it ends with less than it could have found
+        found = check_local(problem, local, deadline, samples=samples)
+        deadline.check("verifying")  # it ends with less than it could have found
     true = {
         "kind": stored.kind == found.kind,
         "multiplier": _close(stored.multiplier, found.multiplier),
