@@ -11,8 +11,8 @@ from problems import doubling, made, steps
 
 import lmdsl as lm
 from lmdsl.cli import main, solving
-from lmdsl.control import controller
 from lmdsl.control.simulation import Simulation
+from lmdsl.machine.deadline import Deadline
 from lmdsl.results import result
 from lmdsl.results.report import Coverage
 
@@ -62,13 +62,13 @@ def test_a_pendulum_with_one_sample_a_cell_says_so(solve, monkeypatch):
     assert last.endswith(": too few samples, or too large cells")
     # Also where a slow machine makes few of the steps.
     monkeypatch.setattr(solving, "STEPS", 100_000)
-    monkeypatch.setattr(controller.Deadline, "__call__", Counting(100_000))
+    monkeypatch.setattr(Deadline, "__call__", Counting(100_000))
     status, out, err = solve(PENDULUM, "--json")
     runs = json.loads(out)["simulation"]
     assert runs["cut"]
     assert 1_500 < runs["steps_made"] < 2_500
     assert runs["reached"] + runs["lost"] + runs["cycling"] == 1_000
-    monkeypatch.setattr(controller.Deadline, "__call__", Counting(100_000))
+    monkeypatch.setattr(Deadline, "__call__", Counting(100_000))
     assert "too few" in solve(PENDULUM)[1]
 
 
