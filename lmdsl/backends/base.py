@@ -65,7 +65,7 @@ class Capabilities(Frozen):
     warm_start
         It makes use of ``Options.start``.
     elimination
-        It is given only the columns that may belong to an optimal policy (elimination.py).
+        It is given only the columns that may belong to an optimal policy (presolve.py).
     tolerance, time_limit, iteration_limit
         It respects these options.
     silent

@@ -2,7 +2,7 @@
 
 From a g-stabilizing start each step changes a control only where strictly better, and evaluates the
 policy as far as the step was worth. The values fall and the last policy is optimal, for every gamma
-and with zeros in the cost; for gamma >= 1 every policy on the way is gamma-stabilizing (policy.py).
+and with zeros in the cost; for gamma >= 1 every policy on the way is gamma-stabilizing.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Whether the local controller keeps the attractor cells: by samples, and by enclosure.
 
 To prove T(x, C0(x), w) in A for every x of a cell, its domain (every state that is located in it)
-is cut into boxes until the enclosed image of each (jets.py) meets attractor cells only. This is
+is cut into boxes until the enclosed image of each meets attractor cells only. This is
 proved of the map as computed, with its rounding, and so of what a simulation can do.
 """
 

@@ -166,7 +166,7 @@ class Program:
         return tuple(results)
 
     def enclose(self, values: Mapping[str, Jet], check: Check | None = None) -> tuple[Jet, ...]:
-        """Enclose all formulas and their derivatives on boxes (see jets.py).
+        """Enclose all formulas and their derivatives on boxes (see enclosures.py).
 
         Parameters
         ----------

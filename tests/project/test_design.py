@@ -191,3 +191,19 @@ def test_no_test_file_is_too_long():
         for path in (PACKAGE.parent / "tests").rglob("test_*.py")
     }
     assert {name for name, lines in lengths.items() if lines > 400} == set()
+
+
+def test_what_the_code_refers_to_is_there():
+    """Files that comments and docstrings name, and cross-references, survive no move unnoticed."""
+    names = {path.name for path in PACKAGE.rglob("*.py")}
+    for name, path in house.modules(PACKAGE).items():
+        text = path.read_text()
+        for file in re.findall(r"\b[a-z_]+\.py\b", text):
+            assert file in names, f"{name} speaks of {file}"
+        for target in re.findall(r":(?:mod|func|class|meth):`lmdsl\.([\w.]+)`", text):
+            item = lm
+            for part in target.split("."):
+                if not hasattr(item, part):
+                    item = importlib.import_module(f"{item.__name__}.{part}")
+                else:
+                    item = getattr(item, part)

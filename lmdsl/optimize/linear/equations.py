@@ -2,7 +2,7 @@
 
 For b >= 0 the smallest nonnegative solution is sum M^k b, finite for every b exactly when the
 spectral radius of M is below 1. The cells outside the core, most of them as a rule, are solved by
-substitution (peeling.py). On the core Gauss-Seidel sweeps converge, from any x >= 0, at least as
+substitution. On the core Gauss-Seidel sweeps converge, from any x >= 0, at least as
 fast as Jacobi's, and keep every iterate >= 0. Where they converge slowly and cells are many, a
 Krylov method makes a better guess. Where that does not help the system is solved directly, class by
 class: the strongly connected classes of M are visited in an order in which

@@ -37,7 +37,7 @@ def evaluate(
     transient
         The policy is known to be gamma-stabilizing, which saves looking whether it reaches A.
     stop
-        Ends the work, with :class:`lmdsl.optimize.linear.equations.Stopped`.
+        Ends the work, with :class:`lmdsl.machine.deadline.Stopped`.
     rows
         gamma P_u, where it is at hand.
     """

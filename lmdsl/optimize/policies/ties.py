@@ -38,7 +38,7 @@ def canonical(
     screen
         Lower bounds of the rivals of each cell's control at this value, where they are known.
     stop
-        Ends the work, with :class:`lmdsl.optimize.linear.equations.Stopped`.
+        Ends the work, with :class:`lmdsl.machine.deadline.Stopped`.
     """
     if screen is None:
         screen = Screen(lp)
