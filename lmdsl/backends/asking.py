@@ -101,10 +101,10 @@ def _copies(lp: StabilizationLP, options: Options) -> tuple[StabilizationLP, Opt
 
 def _without_suboptimal(lp: StabilizationLP, options: Options) -> tuple[Pairs, Options]:
     """Return the columns worth solving for, and the options for a model of these alone."""
-    late, start = Deadline(options.time_limit), options.start
+    deadline, start = Deadline(options.time_limit), options.start
     assert start is not None
-    kept = presolve.survivors(lp, start, options.proof, late)
-    return kept, replace(options, time_limit=late.left, start=np.searchsorted(kept, start))
+    kept = presolve.survivors(lp, start, options.proof, deadline)
+    return kept, replace(options, time_limit=deadline.left, start=np.searchsorted(kept, start))
 
 
 def _plain(lp: StabilizationLP, found: Any) -> Solution:

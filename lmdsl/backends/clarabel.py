@@ -71,7 +71,7 @@ def _solved(scaled: ScaledLP, options: Options) -> Solution:
     except BaseException as error:
         return failure(error)
     word = str(found.status)
-    stop = _stop(word, found.iterations, settings.max_iter, scaled.late(options.time_limit))
+    stop = _stop(word, found.iterations, settings.max_iter, scaled.time_up(options.time_limit))
     if dual:
         stop = SWAPPED.get(stop, stop)
     x, z = np.array(found.x), np.array(found.z)
@@ -113,11 +113,11 @@ def _settings(clarabel: Any, options: Options, factorisation: str) -> Any:
     return settings
 
 
-def _stop(word: str, iterations: int, most: int, late: bool) -> Stop:
+def _stop(word: str, iterations: int, most: int, time_up: bool) -> Stop:
     """Map a status; Clarabel calls a limit "almost" when the last iterate is not far off."""
     stop = STOPS.get(word, Stop.FAILED)
-    if word.startswith("Almost") and (late or iterations >= most):
-        return Stop.TIME_LIMIT if late else Stop.ITERATION_LIMIT
+    if word.startswith("Almost") and (time_up or iterations >= most):
+        return Stop.TIME_LIMIT if time_up else Stop.ITERATION_LIMIT
     return stop
 
 

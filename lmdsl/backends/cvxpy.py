@@ -93,8 +93,8 @@ def _solved(scaled: ScaledLP, options: Options) -> Solution:
         import cvxpy
 
         solver = _solver(cvxpy, options.algorithm)
-        if scaled.late(options.time_limit):
-            return scaled.too_late()
+        if scaled.time_up(options.time_limit):
+            return scaled.out_of_time()
         passed, unsupported = _passed(solver, options, scaled.seconds_left(options.time_limit))
         details = {"solver": solver}
         if unsupported:
@@ -106,12 +106,12 @@ def _solved(scaled: ScaledLP, options: Options) -> Solution:
             problem.solve(solver=solver, **passed)
         except BaseException as error:
             failed = failure(error)
-            if not scaled.late(options.time_limit):
+            if not scaled.time_up(options.time_limit):
                 return Solution(Stop.FAILED, failed.word, details=details)
             return Solution(Stop.TIME_LIMIT, failed.word, details=details)
     iterations = problem.solver_stats.num_iters
-    late = scaled.late(options.time_limit)
-    stop = _stop(problem.status, solver, iterations, options.max_iterations, late)
+    time_up = scaled.time_up(options.time_limit)
+    stop = _stop(problem.status, solver, iterations, options.max_iterations, time_up)
     y = None if balance.dual_value is None else -balance.dual_value
     return scaled.solution(stop, problem.status, y, x.value, iterations, details)
 
@@ -154,13 +154,15 @@ def _passed(
     return ({NESTED[solver]: passed} if solver in NESTED else passed), unsupported
 
 
-def _stop(status: str, solver: str, iterations: int | None, most: int | None, late: bool) -> Stop:
+def _stop(
+    status: str, solver: str, iterations: int | None, most: int | None, time_up: bool
+) -> Stop:
     """Map a status; what is not exact at a limit is the limit."""
     stop = STOPS.get(status, Stop.FAILED)
     exhausted = most is not None and iterations is not None and iterations >= most
     limited = status == "user_limit" or (stop is Stop.INACCURATE and solver in INACCURATE_IS_LIMIT)
-    if limited or (status.endswith("_inaccurate") and (exhausted or late)):
-        return Stop.TIME_LIMIT if late else Stop.ITERATION_LIMIT
+    if limited or (status.endswith("_inaccurate") and (exhausted or time_up)):
+        return Stop.TIME_LIMIT if time_up else Stop.ITERATION_LIMIT
     return stop
 
 

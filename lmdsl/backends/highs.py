@@ -90,8 +90,8 @@ def _solved(scaled: ScaledLP, options: Options) -> Solution:
         highs = highspy.Highs()
         highs.setOptionValue("output_flag", False)
     _choose(highs, options, scaled.seconds_left(options.time_limit))
-    if scaled.late(options.time_limit):
-        return scaled.too_late()
+    if scaled.time_up(options.time_limit):
+        return scaled.out_of_time()
     try:
         highs.passModel(_model(highspy, scaled))
         highs.run()

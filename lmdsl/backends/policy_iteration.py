@@ -32,31 +32,31 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     """Solve by policy iteration."""
     started = time.monotonic()
 
-    def late() -> bool:
+    def time_up() -> bool:
         limit = options.time_limit
         return limit is not None and time.monotonic() - started > limit
 
     policy, w = options.start, options.proof
     if policy is None:
-        found = first_policy.stabilizing(lp, late)
+        found = first_policy.stabilizing(lp, time_up)
         if isinstance(found, first_policy.Refused):
             return Solution(Stop.INFEASIBLE, "infeasible")
         if isinstance(found, first_policy.Undecided):
-            stop = Stop.TIME_LIMIT if late() else Stop.FAILED
+            stop = Stop.TIME_LIMIT if time_up() else Stop.FAILED
             return Solution(stop, stop.name.lower())
         policy, w = found.policy, found.w
     try:
         value = iteration.bound(lp, policy, w)
         if value is None:
-            value = evaluation.evaluate(lp, policy, stop=late)
+            value = evaluation.evaluate(lp, policy, time_up=time_up)
     except Stopped:
         return Solution(Stop.TIME_LIMIT, "time_limit", policy=policy)
     if value is None:
         return Solution(Stop.FAILED, "some cell costs more than 1e305; divide stage_cost")
-    done = iteration.iterate(lp, policy, value, stop=late, limit=options.max_iterations)
+    done = iteration.iterate(lp, policy, value, time_up=time_up, limit=options.max_iterations)
     stop = Stop.OPTIMAL
     if not done.converged:
-        stop = Stop.TIME_LIMIT if late() else Stop.ITERATION_LIMIT
+        stop = Stop.TIME_LIMIT if time_up() else Stop.ITERATION_LIMIT
     word = stop.name.lower()
     return Iterated(stop, word, done.value, None, done.policy, done.steps, iteration=done)
 

@@ -74,11 +74,11 @@ class ScaledLP:
         """Return what building the LP has left of a time limit."""
         return None if limit is None else max(limit - (time.monotonic() - self.started), 0.0)
 
-    def late(self, limit: float | None) -> bool:
+    def time_up(self, limit: float | None) -> bool:
         """Return whether a time limit has passed."""
         return self.seconds_left(limit) == 0.0
 
-    def too_late(self) -> Solution:
+    def out_of_time(self) -> Solution:
         """Return the solution where building the LP has used up the time: solvers may not look."""
         return Solution(Stop.TIME_LIMIT, "time limit reached before the solver started")
 
@@ -93,8 +93,8 @@ class ScaledLP:
             As the backend got them.
         """
         limit = options.time_limit
-        if self.late(limit):
-            return self.too_late()
+        if self.time_up(limit):
+            return self.out_of_time()
         plain = replace(options, start=None, proof=None, progress=None)
         deadline = Deadline(self.seconds_left(limit))
         try:

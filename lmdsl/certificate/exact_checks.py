@@ -14,7 +14,7 @@ from lmdsl.certificate import exact_sums
 from lmdsl.certificate.checks import allowed_residual
 from lmdsl.certificate.claims import NOTHING, Found
 from lmdsl.certificate.sums import LARGEST, rounded_down, rounded_up
-from lmdsl.common.types import Check, Pairs
+from lmdsl.common.types import Guard, Pairs
 from lmdsl.model.lp import StabilizationLP
 
 Fractions = list[Fraction]
@@ -22,12 +22,12 @@ Fractions = list[Fraction]
 
 @dataclass(frozen=True, eq=False)
 class ExactModel:
-    """A model with the rows of a policy read once; ``check`` is called now and then."""
+    """A model with the rows of a policy read once; ``guard`` is called now and then."""
 
     lp: StabilizationLP
     policy: Pairs
     rows: list[exact_sums.Row]
-    check: Check | None
+    guard: Guard | None
 
 
 ExactCheck = Callable[[ExactModel, Fractions], Found]
@@ -49,7 +49,7 @@ def upper_bound(model: ExactModel, V_up: Fractions) -> Found:
 
 def lower_bound(model: ExactModel, W: Fractions) -> Found:
     """Claim 3, and m'W."""
-    if not exact_sums.below_all(model.lp, W, model.lp.cost, model.check):
+    if not exact_sums.below_all(model.lp, W, model.lp.cost, model.guard):
         return NOTHING
     return Found(True, rounded_down(mean(model.lp, W)))
 
@@ -62,7 +62,7 @@ def measure(model: ExactModel, mu: Fractions) -> Found:
 
 def refusal(model: ExactModel, w: Fractions) -> Found:
     """Claim 6."""
-    return Found(any(w) and exact_sums.below_all(model.lp, w, None, model.check))
+    return Found(any(w) and exact_sums.below_all(model.lp, w, None, model.guard))
 
 
 def gap(lp: StabilizationLP, V_up: Fractions, W: Fractions) -> float:

@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Check, Floats, Pairs
+from lmdsl.common.types import Floats, Guard, Pairs
 from lmdsl.model.lp import StabilizationLP
 
 Row = list[tuple[int, int]]
@@ -21,13 +21,13 @@ BLOCK = 2**14
 
 
 def rows(
-    lp: StabilizationLP, columns: NDArray[np.int64], check: Check | None = None
+    lp: StabilizationLP, columns: NDArray[np.int64], guard: Guard | None = None
 ) -> Iterator[tuple[int, Row]]:
-    """Yield (column, [(target in C, numerator), ...]), block by block; ``check`` may raise."""
+    """Yield (column, [(target in C, numerator), ...]), block by block; ``guard`` may raise."""
     numerator, n = lp.rows.shares.numerator, lp.n
     for i in range(0, len(columns), BLOCK):
-        if check is not None:
-            check()
+        if guard is not None:
+            guard()
         block = columns[i : i + BLOCK]
         taken = lp.rows.take(block)
         pointer, target, code = taken.pointer.tolist(), taken.target.tolist(), taken.code.tolist()
@@ -84,7 +84,7 @@ def above_policy(lp: StabilizationLP, rows: list[Row], policy: Pairs, V: list[Fr
 
 
 def below_all(
-    lp: StabilizationLP, x: list[Fraction], cost: Floats | None, check: Check | None = None
+    lp: StabilizationLP, x: list[Fraction], cost: Floats | None, guard: Guard | None = None
 ) -> bool:
     """Decide x <= gamma P_a x + G_a for every surviving pair."""
     a, shift = integers(x)
@@ -92,7 +92,7 @@ def below_all(
     total = lp.rows.shares.total
     left = [value * q * total for value in a]
     unit = q * total * 2**shift
-    for k, row in rows(lp, np.arange(lp.K, dtype=np.int64), check):
+    for k, row in rows(lp, np.arange(lp.K, dtype=np.int64), guard):
         lacking = left[lp.cell[k]] - p * sum(a[j] * s for j, s in row)
         if lacking > 0 and (cost is None or lacking > Fraction(float(cost[k])) * unit):
             return False

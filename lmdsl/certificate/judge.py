@@ -12,7 +12,7 @@ import numpy as np
 
 from lmdsl.certificate import checks, exact_checks, exact_sums, sums
 from lmdsl.certificate.claims import NOTHING, Certificate, Found, Witness
-from lmdsl.common.types import Check, Floats, Pairs
+from lmdsl.common.types import Floats, Guard, Pairs
 from lmdsl.machine import threads
 from lmdsl.model.algorithm_1 import reaches_attractor
 from lmdsl.model.lp import StabilizationLP
@@ -131,7 +131,7 @@ CLAIMS = (STABILIZING, UPPER_BOUND, LOWER_BOUND, MEASURE, REFUSAL)
 """In the order of certificate.json."""
 
 
-def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
+def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
     """Check every claim of a witness against the finite model.
 
     Parameters
@@ -167,22 +167,22 @@ def check(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificat
     return _certificate(lp, policy, found, gap, tolerance)
 
 
-def check_exactly(
-    lp: StabilizationLP, witness: Witness, tolerance: float, check: Check | None = None
+def exact_verdict(
+    lp: StabilizationLP, witness: Witness, tolerance: float, guard: Guard | None = None
 ) -> Certificate:
     """Check every claim of a witness in rational arithmetic.
 
     Parameters
     ----------
     lp, witness, tolerance
-        As for :func:`check`; a claim that holds only with equality holds.
-    check
+        As for :func:`verdict`; a claim that holds only with equality holds.
+    guard
         Called now and then; it may raise.
     """
     policy = _policy(lp, witness)
     columns = np.empty(0, dtype=np.int64) if policy is None else policy
-    rows = [row for _, row in exact_sums.rows(lp, columns, check)]
-    model = exact_checks.ExactModel(lp, columns, rows, check)
+    rows = [row for _, row in exact_sums.rows(lp, columns, guard)]
+    model = exact_checks.ExactModel(lp, columns, rows, guard)
     vectors = {
         name: exact_sums.fractions(x)
         for name in {claim.vector for claim in CLAIMS}

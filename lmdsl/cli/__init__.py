@@ -60,9 +60,9 @@ def _fail(message: str, status: int) -> int:
 
 def _bad(parsed: Arguments, message: str, status: Status = Status.BAD_INPUT) -> int:
     if getattr(parsed, "json", False):
-        from lmdsl.results.report import Report
+        from lmdsl.results.summary import Summary
 
-        report: dict[str, Any] = Report(status=status, message=message).to_dict()
+        report: dict[str, Any] = Summary(status=status, message=message).to_dict()
         if parsed.command == "compare":
             report = {"results": [report], "agreement": None}
         elif parsed.command != "solve":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
+from lmdsl.cli.output import Arguments, Command, ProgressLine, as_json, print_json
 from lmdsl.cli.streams import say
 
 
@@ -29,7 +29,7 @@ def _gamma_max(parsed: Arguments) -> int:
     from lmdsl.problem.problem import load
 
     problem = load(parsed.file)
-    with Progress() as progress:
+    with ProgressLine() as progress:
         found = gamma_max(problem, progress, parsed.time_limit, parsed.width)
     if parsed.json:
         print_json(found.to_dict())
@@ -43,7 +43,7 @@ def _explain(parsed: Arguments) -> int:
     from lmdsl.problem.problem import load
 
     problem = load(parsed.file)
-    with Progress() as progress:
+    with ProgressLine() as progress:
         found = explain(
             problem,
             phase_one=parsed.phase_one,

@@ -30,7 +30,7 @@ def print_json(data: Any, indent: int | None = None) -> None:
     say(json.dumps(data, allow_nan=False, indent=indent))
 
 
-class Progress:
+class ProgressLine:
     """One line on stderr that overwrites itself, only on a terminal."""
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Progress:
         percent = f" {100 * fraction:3.0f} %" if fraction >= 0 else " ..."
         print(f"\r\x1b[K{stage}{percent}", end="", file=sys.stderr, flush=True)
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> ProgressLine:
         return self
 
     def __exit__(self, *_: object) -> None:

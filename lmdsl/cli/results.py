@@ -7,7 +7,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
+from lmdsl.cli.output import Arguments, Command, ProgressLine, as_json, print_json
 from lmdsl.cli.streams import say
 from lmdsl.errors import printable
 from lmdsl.results.formats import FORMATS
@@ -53,7 +53,7 @@ def _time_limit(sub: argparse.ArgumentParser) -> None:
 def _verify(parsed: Arguments) -> int:
     from lmdsl.results.verification import verify
 
-    with Progress() as progress:
+    with ProgressLine() as progress:
         found = verify(
             parsed.dir, exact=parsed.exact, progress=progress, time_limit=parsed.time_limit
         )
@@ -68,7 +68,7 @@ def _simulate(parsed: Arguments) -> int:
     from lmdsl.results.result import Result
 
     result = Result.load(parsed.dir)
-    with Progress() as progress:
+    with ProgressLine() as progress:
         progress("simulate", -1.0)
         runs = result.simulate(
             parsed.starts, parsed.steps, parsed.seed, parsed.hold, parsed.time_limit
@@ -99,7 +99,7 @@ def _export(parsed: Arguments) -> int:
 
     refuse_own_file(parsed.out)
     result = Result.load(parsed.dir)
-    with Progress() as progress:
+    with ProgressLine() as progress:
         lp = recompiled(parsed.dir, result, progress, parsed.time_limit)
     import_module(f"lmdsl.results.exports.{parsed.format}").write(result, lp, parsed.out)
     say(f"written to {printable(parsed.out)}")

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lmdsl.cli.output import Arguments, Command, Progress, as_json, print_json
+from lmdsl.cli.output import Arguments, Command, ProgressLine, as_json, print_json
 from lmdsl.cli.streams import say, tell
 from lmdsl.errors import LmdslError, plain_text, printable
 from lmdsl.results.status import Status
@@ -66,7 +66,7 @@ def _solve(parsed: Arguments) -> int:
     problem = _problem(parsed)
     from lmdsl.results.solving import solve
 
-    with Progress() as progress:
+    with ProgressLine() as progress:
         result = solve(
             problem,
             parsed.backend,
@@ -116,7 +116,7 @@ def _simulated(result: Any) -> Any:
     if (result.control_index < 0).all():
         return result
     try:
-        with Progress() as progress:
+        with ProgressLine() as progress:
             progress("simulate", -1.0)
             runs = result.simulate(STARTS, STEPS, time_limit=SECONDS)
     except Exception as error:
@@ -130,7 +130,7 @@ def _compare(parsed: Arguments) -> int:
     from lmdsl.results.comparison import compare
 
     names = [name.strip() for name in parsed.backends.split(",") if name.strip()]
-    with Progress() as progress:
+    with ProgressLine() as progress:
         comparison = compare(
             problem,
             names,

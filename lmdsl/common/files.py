@@ -69,7 +69,7 @@ def reason(error: Exception) -> str:
     return (getattr(error, "strerror", None) or str(error)).lower()
 
 
-class _Fault:
+class _Flaw:
     """Stands in the parsed data for something JSON or the format does not allow."""
 
     def __init__(self, message: str) -> None:
@@ -145,7 +145,7 @@ def strict_json(content: bytes, null: bool = False) -> Any:
             text,
             object_pairs_hook=_object,
             parse_int=_integer,
-            parse_constant=lambda word: _Fault(f"{word} is not a number of JSON; use a finite one"),
+            parse_constant=lambda word: _Flaw(f"{word} is not a number of JSON; use a finite one"),
         )
     except json.JSONDecodeError as error:
         raise BadInput(
@@ -159,7 +159,7 @@ def strict_json(content: bytes, null: bool = False) -> Any:
 
 def _integer(digits: str) -> Any:
     if len(digits) > 320:
-        return _Fault(f"an integer of {len(digits)} digits is out of range; use a smaller number")
+        return _Flaw(f"an integer of {len(digits)} digits is out of range; use a smaller number")
     return int(digits)
 
 
@@ -169,7 +169,7 @@ def _object(pairs: list[tuple[str, Any]]) -> Any:
         seen: set[str] = set()
         for key, _ in pairs:
             if key in seen:
-                return _Fault(f"the key {shown(key)} stands twice; keep one")
+                return _Flaw(f"the key {shown(key)} stands twice; keep one")
             seen.add(key)
     return found
 
@@ -177,7 +177,7 @@ def _object(pairs: list[tuple[str, Any]]) -> Any:
 def _refuse_faults(data: Any, where: str, null: bool, depth: int = 0) -> None:
     if depth > MAX_NESTING:
         raise BadInput(f"nested deeper than {MAX_NESTING} levels")
-    if isinstance(data, _Fault):
+    if isinstance(data, _Flaw):
         raise BadInput(data.message, where)
     if data is None and not null:
         raise BadInput("null is not a value of the format; leave the key out", where)

@@ -85,8 +85,8 @@ Numbers = Annotated[tuple[Number, ...], Field(fail_fast=True, min_length=1), Bef
 frozen_dict = AfterValidator(FrozenDict)
 
 
-Interval = Annotated[tuple[Number, Number], BeforeValidator(plain)]
-Box = Annotated[dict[str, Interval], BeforeValidator(plain), frozen_dict]
+LowHigh = Annotated[tuple[Number, Number], BeforeValidator(plain)]
+Box = Annotated[dict[str, LowHigh], BeforeValidator(plain), frozen_dict]
 """Axis name to ``[a, b]``; axes left out are unrestricted."""
 
 

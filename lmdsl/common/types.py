@@ -14,7 +14,7 @@ Indices = NDArray[np.int64]
 Pairs = NDArray[np.int64]
 """A policy: a column per position of C, shape (n,); or any columns."""
 
-Stop = Callable[[], bool]
+TimeUp = Callable[[], bool]
 """Asked now and then by what takes long: True ends the work early."""
 Progress = Callable[[str, float], None]
 """Told what is being done, and which part of it, 0 to 1, is done."""
@@ -25,5 +25,5 @@ def never() -> bool:
     return False
 
 
-Check = Callable[[], object]
+Guard = Callable[[], object]
 """Asked during long evaluations whether to go on; it raises if not."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Check, Floats, Indices
+from lmdsl.common.types import Floats, Guard, Indices
 from lmdsl.formulas.enclosures import Jet, apply, enclosure
 from lmdsl.formulas.intervals import Interval, subtract
 from lmdsl.formulas.program import FUNCTION
@@ -81,7 +81,7 @@ class LocalCheck:
     __str__ = sentence
 
 
-def check(
+def examine(
     problem: Problem,
     local: LocalController,
     deadline: Deadline | None = None,
@@ -156,7 +156,7 @@ def _stays(
     for start in range(0, len(nodes), width):
         some = nodes[start : start + width]
         shape, noise = (len(x), len(some)), list(some.T[:, None, :])
-        images = true_map(states, controls, noise, partial(deadline.check, DOING))
+        images = true_map(states, controls, noise, partial(deadline.raise_if_over, DOING))
         target = local.partition.locate([np.broadcast_to(y, shape) for y in images])
         stays &= ((target >= 0) & local.attractor[target]).all(axis=1)
     return stays
@@ -199,7 +199,7 @@ def _kept(
     A box whose image is not enclosed in A is halved along its longest side (in cell widths),
     unless its centre is mapped outside: then its cell is lost.
     """
-    partition, check = local.partition, partial(deadline.check, DOING)
+    partition, guard = local.partition, partial(deadline.raise_if_over, DOING)
     (low, high, home), work = partition.domain(cells), 0.0
     lost = np.zeros(len(cells), dtype=np.bool_)
     for _ in range(ROUNDS * partition.dimension):
@@ -209,8 +209,8 @@ def _kept(
         inside = np.ones(len(home), dtype=np.bool_)
         with np.errstate(all="ignore"):
             for node in nodes:
-                check()
-                images = _images(true_map, local, cells[home], low, high, node, check)
+                guard()
+                images = _images(true_map, local, cells[home], low, high, node, guard)
                 inside &= _into(partition, local.attractor, images)
         centre = low / 2 + high / 2
         lost[home[~_stays(true_map, local, centre, cells[home], nodes, deadline)]] = True
@@ -233,14 +233,14 @@ def _images(
     low: Floats,
     high: Floats,
     noise: Floats,
-    check: Check,
+    guard: Guard,
 ) -> list[Interval]:
     """Enclose T(x, C0(x), w) on boxes."""
     centre = Interval.point(low / 2 + high / 2)
     away = subtract(Interval(low, high), centre)
     steps = [Interval(*(end[:, k] for end in away)) for k in range(local.partition.dimension)]
-    images = _closed(true_map, local, cell, Interval(low, high), noise, check)
-    middle = _closed(true_map, local, cell, centre, noise, check)
+    images = _closed(true_map, local, cell, Interval(low, high), noise, guard)
+    middle = _closed(true_map, local, cell, centre, noise, guard)
     return [enclosure(image, at, steps) for image, at in zip(images, middle, strict=True)]
 
 
@@ -250,7 +250,7 @@ def _closed(
     cell: Indices,
     box: Interval,
     noise: Floats,
-    check: Check,
+    guard: Guard,
 ) -> tuple[Jet, ...]:
     """Return jets of the closed loop, derivatives with respect to the states."""
     d = local.partition.dimension
@@ -260,7 +260,7 @@ def _closed(
         return apply(operation, [y if isinstance(y, Jet) else Jet.constant(y, d) for y in operands])
 
     u, w = local.law(x, cell, on_jets), [Jet.constant(value, d) for value in noise]
-    images = true_map.enclose(x, u, w, check)
+    images = true_map.enclose(x, u, w, guard)
     assert images is not None
     return images
 

@@ -168,7 +168,7 @@ class ClosedLoop:
         if self.problem.noises:
             node = rng.choice(len(self.probability), size=len(x), p=self.probability)
             noise = list(self.nodes.values[node].T)
-        return self.true_map.step(x, u, noise, partial(deadline.check, "simulating"))
+        return self.true_map.step(x, u, noise, partial(deadline.raise_if_over, "simulating"))
 
     def run(
         self, x: Floats, steps: int, rng: np.random.Generator, deadline: Deadline = FOREVER

@@ -40,7 +40,7 @@ MEANING = {
 
 
 @dataclass(frozen=True)
-class Cause:
+class LostCells:
     """The cells that one cause keeps outside C.
 
     Attributes
@@ -84,7 +84,7 @@ class Explanation(Frozen):
     problem: Problem
     partition: Partition
     cell_status: NDArray[np.uint8]
-    causes: tuple[Cause, ...]
+    causes: tuple[LostCells, ...]
     hints: tuple[Hint, ...]
     phase_one: PhaseOne | None = None
     assembled: Transitions | None = field(default=None, compare=False)
@@ -129,7 +129,7 @@ class Explanation(Frozen):
             return Why(moves=one_cell.moves(self.sampler, self.cell_status, i), **known)
         if status != CellStatus.TRAPPED:
             return Why(**known)
-        free = self.transitions.regions.free
+        free = self.transitions.sets.free
         start = int(np.searchsorted(free, i))
         pair_pointer, rows = self.transitions.pair_pointer, self.transitions.rows
         reached = free[one_cell.reachable(pair_pointer, rows, start)]
@@ -263,7 +263,7 @@ def explain(
             parts = boxes.regions(partition, mask, regions)
             cells = int(mask.sum())
             inside = sum(part.cells for part in parts)
-            found.append(Cause(NAMES[code], cells, parts, cells - inside))
+            found.append(LostCells(NAMES[code], cells, parts, cells - inside))
     solved = None
     if phase_one and assembled is not None:
         solved = PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
@@ -302,7 +302,7 @@ def _status(
     """Return the status of every cell, shape (N,)."""
     found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
     status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)
-    status[transitions.regions.free] = stabilizable_set.causes(found, transitions.pair_pointer)
-    status[transitions.regions.attractor] = CellStatus.ATTRACTOR
+    status[transitions.sets.free] = stabilizable_set.causes(found, transitions.pair_pointer)
+    status[transitions.sets.attractor] = CellStatus.ATTRACTOR
     status.setflags(write=False)
     return status

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.json_values import jsonable
-from lmdsl.common.types import Bools, Floats
+from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.model.assembly.sampler import CHUNK, Sampler
 from lmdsl.model.discretization import control_values
 from lmdsl.model.grid.axis import EDGE
@@ -38,8 +38,6 @@ STEPS, NEAR, SUPPORT, QUANTILE = 64, 0.25, 0.05, 0.9
 MOST_CELLS, MOST_CONTROLS, MOST_POINTS, MOST_NODES = 512, 64, 16, 4
 BEYOND = (0.0, 0.125, 0.25, 0.5, 1.0)
 """How far beyond the end of a control's range is tried, in lengths of the range."""
-
-Cells = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -105,7 +103,7 @@ class _Trial:
         low, high = self.partition.low, self.partition.high
         self.span = high - low
 
-    def start(self, cells: Cells) -> list[Floats]:
+    def start(self, cells: Indices) -> list[Floats]:
         """Return the states of sample points, per axis (cells, 1, points, 1)."""
         return [x[:, None, :, None] for x in self.partition.samples(cells, self.points)]
 
@@ -141,7 +139,7 @@ class _Trial:
         return p.names[k], "high" if high else "low", place, float(self.span[k])
 
 
-def _by_runs(trial: _Trial, cells: Cells) -> list[Hint]:
+def _by_runs(trial: _Trial, cells: Indices) -> list[Hint]:
     shape = (len(cells), len(trial.controls), len(trial.points), len(trial.nodes))
     held = trial.vectors()
     state: list[Floats] = [np.broadcast_to(x, shape) for x in trial.start(cells)]
@@ -168,7 +166,7 @@ def _by_runs(trial: _Trial, cells: Cells) -> list[Hint]:
     ]
 
 
-def _finer(trial: _Trial, cells: Cells, finer: Bools, staying: Floats) -> list[Hint]:
+def _finer(trial: _Trial, cells: Indices, finer: Bools, staying: Floats) -> list[Hint]:
     count, tried = int(finer.sum()), len(cells)
     if count < max(1.0, SUPPORT * tried):
         return []
@@ -217,7 +215,7 @@ def _larger(trial: _Trial, open_: Bools, arrived: Bools, most: Floats) -> list[H
     return found
 
 
-def _worst(trial: _Trial, cells: Cells, controls: list[Floats]) -> Floats:
+def _worst(trial: _Trial, cells: Indices, controls: list[Floats]) -> Floats:
     """Return the largest overshoot of the samples, in lengths of the axis, (cells, controls).
 
     Infinite where a sample enters ``avoid`` or is not finite.
@@ -230,7 +228,7 @@ def _worst(trial: _Trial, cells: Cells, controls: list[Floats]) -> Floats:
     return np.asarray(worst.max(axis=(2, 3)))
 
 
-def _more_controls(trial: _Trial, cells: Cells) -> list[Hint]:
+def _more_controls(trial: _Trial, cells: Indices) -> list[Hint]:
     vectors = trial.controls[_worst(trial, cells, trial.vectors()).argmin(axis=1)]
     found = []
     for k, values in enumerate(control_values(trial.sampler.problem)):

@@ -96,8 +96,8 @@ class PhaseOne(Frozen):
 
         rows, pointer = transitions.rows, transitions.pair_pointer
         F, K = rows.columns, rows.count
-        cells = transitions.regions.free
-        weight = transitions.regions.weight(cells)
+        cells = transitions.sets.free
+        weight = transitions.sets.weight(cells)
         if not F:
             return cls(partition, cells, status[cells], weight, np.zeros(0), np.zeros(0), 0.0)
         entries = K + len(rows.target) + 2 * F
@@ -108,14 +108,14 @@ class PhaseOne(Frozen):
         # The weights are scaled to 1 so that the solver's tolerances mean the same for every F.
         scale = max(int((weight > 0).sum()), 1)
         deadline, doing = Deadline.of(deadline), "solving the phase-one LP"
-        deadline.check(doing)
+        deadline.raise_if_over(doing)
         matrix = hstack([B, eye_array(F), -eye_array(F)], format="csc")
         x, marginals, failed = apart.call(
             linprog.solved, price, matrix, weight * scale, deadline.left,
             deadline=deadline, doing=doing,
         )  # fmt: skip
         if failed:
-            deadline.check(doing)
+            deadline.raise_if_over(doing)
             raise LmdslError(f"the phase-one LP was not solved: {shown(failed, 200)}")
         theta = np.maximum(x[:K], 0.0) / scale
         residual = weight - B @ theta

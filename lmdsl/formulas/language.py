@@ -16,8 +16,8 @@ and tabs separate. Nodes are numbers, names, operators, signs and functions. Dep
 the number of brackets, calls, signs and powers that stand inside one another: ``x`` has
 depth 0, ``sin((-x))`` depth 3. A flat chain of ``+ -`` or ``* /`` adds none, however long.
 
-`parse` turns a text into a `Formula`, a flat list of steps, operands before their users.
-`lmdsl.formulas.program.Program` joins formulas, merges equal steps and evaluates them on arrays.
+`parse` turns a text into a `Formula`, a flat list of subformulas, operands before their users.
+`lmdsl.formulas.program.Program` joins them, merges equal subformulas and evaluates them on arrays.
 Nothing is reordered or simplified, save that a power with the constant exponent 2 is a square.
 """
 
@@ -72,8 +72,8 @@ class FormulaError(BadInput):
         super().__init__(message, where)
 
 
-class Step(NamedTuple):
-    """One step of a formula: ``constant``, ``name``, or an operation on earlier steps."""
+class Subformula(NamedTuple):
+    """One subformula: ``constant``, ``name``, or an operation on earlier ones."""
 
     operation: str
     operands: tuple[int, ...] = ()
@@ -91,13 +91,13 @@ class Formula:
         What the user wrote.
     names
         The declared names that it uses.
-    steps
-        The formula in evaluation order; the last step is its value.
+    subformulas
+        The formula in evaluation order; the last is the formula itself.
     """
 
     text: str
     names: frozenset[str]
-    steps: tuple[Step, ...] = field(repr=False)
+    subformulas: tuple[Subformula, ...] = field(repr=False)
 
 
 def check_name(name: str) -> None:
@@ -137,8 +137,8 @@ def parse(text: str, names: Collection[str]) -> Formula:
     if len(text) > MAX_CHARACTERS:
         fault = f"the formula goes on to {len(text):,} characters; the limit is {MAX_CHARACTERS:,}"
         raise _error(MAX_CHARACTERS, fault)
-    steps = _Parser(text, names).steps
-    return Formula(text, frozenset(step.name for step in steps if step.name), tuple(steps))
+    parts = _Parser(text, names).subformulas
+    return Formula(text, frozenset(part.name for part in parts if part.name), tuple(parts))
 
 
 def _error(position: int, fault: str) -> FormulaError:
@@ -157,10 +157,10 @@ class _Token(NamedTuple):
     start: int
 
 
-class _Node(NamedTuple):
-    """A parsed subexpression: its step, its span in the text, its value if constant."""
+class _Parsed(NamedTuple):
+    """A parsed subexpression: its place, its span in the text, its value if constant."""
 
-    step: int
+    place: int
     start: int
     stop: int
     constant: float | None
@@ -172,7 +172,7 @@ class _Parser:
 
     def __init__(self, text: str, names: Collection[str]) -> None:
         self.text, self.names = text, names
-        self.steps: list[Step] = []
+        self.subformulas: list[Subformula] = []
         self.nodes = self.depth = 0
         self.stop = 0  # end of the last token consumed
         self.token = self._scan()
@@ -222,7 +222,7 @@ class _Parser:
             raise _error(start, fault)
         raise _error(start, f"{shown(text)} stands where {expected} is expected")
 
-    def _require_values(self, nodes: Sequence[_Node]) -> None:
+    def _require_values(self, nodes: Sequence[_Parsed]) -> None:
         for node in nodes:
             if node.comparison >= 0:
                 rule = "a comparison may only be the first argument of where"
@@ -240,17 +240,18 @@ class _Parser:
             fault = f"brackets, calls, signs and powers nest deeper than {MAX_DEPTH}"
             raise _error(start, f"{fault}; shorten the formula")
 
-    def _leaf(self, step: Step) -> _Node:
+    def _leaf(self, part: Subformula) -> _Parsed:
         start = self._advance().start
         self._count(start)
-        self.steps.append(step)
-        return _Node(len(self.steps) - 1, start, self.stop, None if step.name else step.value)
+        self.subformulas.append(part)
+        constant = None if part.name else part.value
+        return _Parsed(len(self.subformulas) - 1, start, self.stop, constant)
 
-    def _apply(self, operation: str, operands: Sequence[_Node], at: int, start: int) -> _Node:
+    def _apply(self, operation: str, operands: Sequence[_Parsed], at: int, start: int) -> _Parsed:
         """Append an operation whose text runs from `start` to here; `at` is its operator."""
         self._count(at)
         self._require_values(operands[1:] if operation == "where" else operands)
-        self.steps.append(Step(operation, tuple(operand.step for operand in operands)))
+        self.subformulas.append(Subformula(operation, tuple(operand.place for operand in operands)))
         values = [operand.constant for operand in operands if operand.constant is not None]
         constant = fold(operation, values) if len(values) == len(operands) else None
         if constant is not None and not math.isfinite(constant):
@@ -258,9 +259,9 @@ class _Parser:
             fault = f"{shown(self.text[start : self.stop])} is {kind}; constants must be finite"
             raise _error(start, fault)
         comparison = at if operation in _COMPARISONS else -1
-        return _Node(len(self.steps) - 1, start, self.stop, constant, comparison)
+        return _Parsed(len(self.subformulas) - 1, start, self.stop, constant, comparison)
 
-    def _expression(self, lowest: int) -> _Node:
+    def _expression(self, lowest: int) -> _Parsed:
         """Parse operands joined by operators that bind at least as tightly as `lowest`."""
         left = self._operand()
         while (rank := _RANK.get(self.token.text, 0)) >= lowest:
@@ -276,10 +277,10 @@ class _Parser:
             left = self._apply(operator, (left, right), at, left.start)
         return left
 
-    def _operand(self) -> _Node:
+    def _operand(self) -> _Parsed:
         kind, text, start = self.token
         if kind == "number":
-            return self._leaf(Step("constant", value=float(text)))
+            return self._leaf(Subformula("constant", value=float(text)))
         if kind == "name":
             return self._name(text, start)
         if text not in ("+", "-", "("):
@@ -302,24 +303,24 @@ class _Parser:
             self._unexpected(expected)
         self._advance()
 
-    def _name(self, text: str, start: int) -> _Node:
+    def _name(self, text: str, start: int) -> _Parsed:
         if text in FORMULA_FUNCTIONS:
             return self._call(text, start)
         if text in FORMULA_CONSTANTS:
-            return self._leaf(Step("constant", value=FORMULA_CONSTANTS[text]))
+            return self._leaf(Subformula("constant", value=FORMULA_CONSTANTS[text]))
         if text in self.names:
-            return self._leaf(Step("name", name=text))
+            return self._leaf(Subformula("name", name=text))
         declared = ", ".join(sorted(self.names)[:20]) + ", ..." * (len(self.names) > 20)
         listed = f"declared names are {declared}" if declared else "no names are declared"
         raise _error(start, f"{shown(text)} is not a declared name or function; {listed}")
 
-    def _call(self, name: str, start: int) -> _Node:
+    def _call(self, name: str, start: int) -> _Parsed:
         self._advance()
         if self.token.text != "(":
             raise _error(start, f"{shown(name)} is a function; give its arguments in brackets")
         self._deeper(start)
         self._advance()
-        arguments: list[_Node] = []
+        arguments: list[_Parsed] = []
         while arguments or self.token.text != ")":
             arguments.append(self._expression(_COMPARE))
             if self.token.text != ",":

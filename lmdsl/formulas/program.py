@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Check
+from lmdsl.common.types import Guard
 from lmdsl.errors import BadInput
 from lmdsl.formulas.enclosures import Jet, apply
-from lmdsl.formulas.language import Formula, Step, fold
+from lmdsl.formulas.language import Formula, Subformula, fold
 from lmdsl.formulas.operations import OPERATIONS, PLAIN
 
 
@@ -27,7 +27,7 @@ class Instruction(NamedTuple):
 
 
 class Program:
-    """Several formulas compiled together, each distinct step evaluated once.
+    """Several formulas compiled together, each distinct subformula evaluated once.
 
     Parameters
     ----------
@@ -64,68 +64,68 @@ class Program:
         instructions: list[Instruction] = []
         for formula in formulas:
             placed: list[int] = []
-            for step in formula.steps:
-                key, value = self._identify(step, [placed[k] for k in step.operands], constants)
+            for part in formula.subformulas:
+                key, value = self._identify(part, [placed[k] for k in part.operands], constants)
                 slot = self._slots.setdefault(key, len(self.template))
                 if slot == len(self.template):
                     self.template.append(value)
-                    if value is None and step.operands:
-                        instructions.append(Instruction(step.operation, key[1], slot))
+                    if value is None and part.operands:
+                        instructions.append(Instruction(part.operation, key[1], slot))
                 placed.append(slot)
             self.outputs.append(placed[-1])
         self.variables = {str(k[1]): s for k, s in self._slots.items() if k[0] == "name"}
         self.instructions = self._with_lifetimes(_needed(instructions, self.outputs))
         self.names = frozenset(self.variables)
-        self.operations = tuple(step.operation for step in instructions)
+        self.operations = tuple(instruction.operation for instruction in instructions)
         self.effort, self.work = _effort(self.operations)
 
     def _identify(
-        self, step: Step, operands: Sequence[int], constants: Mapping[str, float]
+        self, part: Subformula, operands: Sequence[int], constants: Mapping[str, float]
     ) -> tuple[tuple[str, Any], float | None]:
-        """Return a key, the same for steps with equal bits, and the value if constant."""
+        """Return a key, the same for subformulas with equal bits, and the value if constant."""
         values = [value for k in operands if (value := self.template[k]) is not None]
-        if step.operation == "constant":
-            value = step.value
-        elif step.name in constants:
-            value = float(constants[step.name])
+        if part.operation == "constant":
+            value = part.value
+        elif part.name in constants:
+            value = float(constants[part.name])
         elif operands and len(values) == len(operands):
-            value = fold(step.operation, values)
+            value = fold(part.operation, values)
         else:
-            return (step.operation, step.name or tuple(operands)), None
+            return (part.operation, part.name or tuple(operands)), None
         return ("constant", np.float64(value).tobytes()), value
 
     def _with_lifetimes(self, instructions: Sequence[Instruction]) -> list[Instruction]:
         live = set(self.outputs) | {k for k, v in enumerate(self.template) if v is not None}
         inputs = set(self.variables.values())
         marked: list[Instruction] = []
-        for step in reversed(instructions):
-            released = tuple(dict.fromkeys(k for k in step.operands if k not in live))
-            live.update(step.operands)
-            in_place = step.operation in PLAIN
+        for instruction in reversed(instructions):
+            released = tuple(dict.fromkeys(k for k in instruction.operands if k not in live))
+            live.update(instruction.operands)
+            in_place = instruction.operation in PLAIN
             reusable = tuple(k for k in released if in_place and k not in inputs)
-            marked.append(step._replace(released=released, reusable=reusable))
+            marked.append(instruction._replace(released=released, reusable=reusable))
         held = self.live = 0
-        for step in reversed(marked):
+        for instruction in reversed(marked):
             held += 1
             self.live = max(self.live, held + 1)  # an operation may need one more for itself
-            held -= sum(k not in inputs for k in step.released)
+            held -= sum(k not in inputs for k in instruction.released)
         return marked[::-1]
 
     def part(self, outputs: Sequence[int]) -> Program:
         """Return the program that computes some of the slots, and nothing that they do not need."""
         part = copy.copy(self)
         part.outputs = list(outputs)
-        steps = _needed(self.instructions, outputs)
-        read = {*outputs, *(k for step in steps for k in step.operands)}
+        needed = _needed(self.instructions, outputs)
+        read = {*outputs, *(k for instruction in needed for k in instruction.operands)}
         part.variables = {name: k for name, k in self.variables.items() if k in read}
-        part.instructions = part._with_lifetimes(steps)
+        part.instructions = part._with_lifetimes(needed)
         part.names, part.formulas = frozenset(part.variables), ()
-        part.operations = tuple(step.operation for step in part.instructions)
+        part.operations = tuple(instruction.operation for instruction in part.instructions)
         part.effort, part.work = _effort(part.operations)
         return part
 
     def __call__(
-        self, values: Mapping[str, NDArray[Any] | float], check: Check | None = None
+        self, values: Mapping[str, NDArray[Any] | float], guard: Guard | None = None
     ) -> tuple[NDArray[np.float64], ...]:
         """Evaluate all formulas.
 
@@ -134,7 +134,7 @@ class Program:
         values
             An array or number for each of `names`, in shapes that broadcast together.
             They are read as float64 and never changed; other keys are ignored.
-        check
+        guard
             Called before every operation; it may raise.
 
         Returns
@@ -150,8 +150,8 @@ class Program:
             slots[slot] = np.asarray(values[name], dtype=np.float64)
         with np.errstate(all="ignore"):
             for operation, places, target, released, reusable in self.instructions:
-                if check is not None:
-                    check()
+                if guard is not None:
+                    guard()
                 operands = [slots[k] for k in places]
                 room = _room(operands, [slots[k] for k in reusable]) if reusable else {}
                 slots[target] = OPERATIONS[operation](*operands, **room)
@@ -165,14 +165,14 @@ class Program:
             aliases.add(slot)
         return tuple(results)
 
-    def enclose(self, values: Mapping[str, Jet], check: Check | None = None) -> tuple[Jet, ...]:
+    def enclose(self, values: Mapping[str, Jet], guard: Guard | None = None) -> tuple[Jet, ...]:
         """Enclose all formulas and their derivatives on boxes (see enclosures.py).
 
         Parameters
         ----------
         values
             A jet for each of `names`, all with the same number of directions.
-        check
+        guard
             Called before every operation; it may raise.
         """
         directions = max((len(jet.slope.low) for jet in values.values()), default=0)
@@ -182,10 +182,10 @@ class Program:
         for name, slot in self.variables.items():
             slots[slot] = values[name]
         with np.errstate(all="ignore"):
-            for step in self.instructions:
-                if check is not None:
-                    check()
-                slots[step.target] = apply(step.operation, [slots[k] for k in step.operands])
+            for operation, operands, target, *_ in self.instructions:
+                if guard is not None:
+                    guard()
+                slots[target] = apply(operation, [slots[k] for k in operands])
         return tuple(slots[slot] for slot in self.outputs)
 
 
@@ -202,10 +202,10 @@ def _effort(operations: Sequence[str]) -> tuple[int, int]:
 def _needed(instructions: Sequence[Instruction], outputs: Sequence[int]) -> list[Instruction]:
     """Return the instructions whose results are needed: nothing would ever release the others."""
     needed, kept = set(outputs), []
-    for step in reversed(instructions):
-        if step.target in needed:
-            needed.update(step.operands)
-            kept.append(step)
+    for instruction in reversed(instructions):
+        if instruction.target in needed:
+            needed.update(instruction.operands)
+            kept.append(instruction)
     return kept[::-1]
 
 

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from lmdsl.errors import LmdslError
 from lmdsl.machine.deadline import Deadline
 
-Found = TypeVar("Found")
+T = TypeVar("T")
 
 LARGE = 50_000
 """Entries of a matrix above which native calls may take longer than anybody wants to wait."""
@@ -35,12 +35,12 @@ class Ended(LmdslError):
 
 
 def call(
-    function: Callable[..., Found],
+    function: Callable[..., T],
     *arguments: Any,
     deadline: Deadline,
     doing: str,
     entries: int = LARGE,
-) -> Found:
+) -> T:
     """Return ``function(*arguments)``, made by a child where that is worth it.
 
     Parameters
@@ -90,7 +90,7 @@ def call(
         child.stdout.close()
         status = child.wait()
     if reply is None:
-        deadline.check(doing)
+        deadline.raise_if_over(doing)
         why = f"signal {-status}" if status < 0 else f"status {status}"
         raise Ended(f"the process of the solver ended ({why}), perhaps for want of memory")
     error, found = reply

@@ -63,7 +63,7 @@ class Deadline:
         """Seconds that are left, positive however late; None for no limit."""
         return None if self._at == math.inf else max(self._at - time.monotonic(), 1e-9)
 
-    def check(self, doing: str) -> None:
+    def raise_if_over(self, doing: str) -> None:
         """Raise :class:`TimeLimitReached` once the time is up."""
         if self():
             raise TimeLimitReached(doing)

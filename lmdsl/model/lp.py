@@ -30,7 +30,7 @@ from lmdsl.model.grid.directions import Directions
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
 from lmdsl.model.rows import Rows
-from lmdsl.model.sets import Regions
+from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 
@@ -300,16 +300,16 @@ def compile(  # noqa: A001
     require_least(problem)
     patient = unless_short(problem, deadline)
     if problem.local_controller is not None:  # refuse a wrong one before the work
-        attractor = Regions.of(problem, partition, patient).attractor
+        attractor = CellSets.of(problem, partition, patient).attractor
         LocalController.of(problem, partition, attractor, patient)
     transitions = assemble(problem, partition, progress, deadline)
-    regions = transitions.regions
+    sets = transitions.sets
     found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
     kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
     status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)
-    status[regions.free] = stabilizable_set.causes(found, transitions.pair_pointer)
-    status[regions.attractor] = CellStatus.ATTRACTOR
-    cells = regions.free[found.inside]
+    status[sets.free] = stabilizable_set.causes(found, transitions.pair_pointer)
+    status[sets.attractor] = CellStatus.ATTRACTOR
+    cells = sets.free[found.inside]
     # The search that found C ends with Algorithm 1 on the surviving pairs.
     policy = found.pair[found.inside]
     column = policy if isinstance(kept, slice) else np.searchsorted(kept, policy)
@@ -324,7 +324,7 @@ def compile(  # noqa: A001
         rows=rows,
         cost=transitions.cost[kept],
         gamma=problem.gamma,
-        weight=regions.weight(cells),
+        weight=sets.weight(cells),
         _known=(found.level[found.inside], column),
     )
     for array in (lp.controls, lp.control, lp.cost):  # views

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Check
+from lmdsl.common.types import Guard
 from lmdsl.errors import BadInput
 from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
@@ -26,7 +26,7 @@ PART = 2**16
 
 
 @dataclass(frozen=True, eq=False)
-class Regions:
+class CellSets:
     """Which cells are attractor (A), avoid (Z) or free (neither).
 
     Attributes
@@ -59,7 +59,7 @@ class Regions:
     @classmethod
     def of(
         cls, problem: Problem, partition: Partition, deadline: Deadline | None = None
-    ) -> Regions:
+    ) -> CellSets:
         """Resolve the attractor, avoid and measure of a problem.
 
         Raises
@@ -71,20 +71,20 @@ class Regions:
             attractor and avoid.
         """
         memory.require(CELL * partition.size, "the sets of cells")
-        check = partial(Deadline.of(deadline).check, "compiling")
-        attractor = _attractor(problem, partition, check)
+        guard = partial(Deadline.of(deadline).raise_if_over, "compiling")
+        attractor = _attractor(problem, partition, guard)
         avoid = np.zeros(partition.size, dtype=np.bool_)
         if problem.avoid:
             boxes = (
                 partition.overlapping_box(box, f"avoid.boxes[{i}]")
                 for i, box in enumerate(problem.avoid.boxes)
             )
-            avoid = partition.mask(boxes, check)
+            avoid = partition.mask(boxes, guard)
         both = np.flatnonzero(attractor & avoid)
         if len(both):
             index = [int(k) for k in np.unravel_index(both[0], partition.shape)]
             raise BadInput(f"cell {index} is both attractor and avoid; shrink one of them", "avoid")
-        mass = _mass(problem, partition, check)
+        mass = _mass(problem, partition, guard)
         free = np.flatnonzero(~attractor & ~avoid)
         number = np.full(partition.size, -1, dtype=np.int32)
         number[free] = np.arange(len(free), dtype=np.int32)
@@ -92,7 +92,7 @@ class Regions:
         return cls(attractor, avoid, mass, free, number)
 
 
-def _mass(problem: Problem, partition: Partition, check: Check) -> NDArray[np.float64]:
+def _mass(problem: Problem, partition: Partition, guard: Guard) -> NDArray[np.float64]:
     mass = np.ones(partition.size)
     measure = problem.measure
     if measure is None:
@@ -110,7 +110,7 @@ def _mass(problem: Problem, partition: Partition, check: Check) -> NDArray[np.fl
         for start in range(0, partition.size, PART):
             some = np.arange(start, min(start + PART, partition.size))
             centres = partition.centres(some)
-            mass[some] = program(dict(zip(partition.names, centres.T, strict=True)), check)[0]
+            mass[some] = program(dict(zip(partition.names, centres.T, strict=True)), guard)[0]
         bad = np.flatnonzero(~((mass >= 0) & np.isfinite(mass)))
         if len(bad):
             index = [int(k) for k in np.unravel_index(bad[0], partition.shape)]
@@ -123,7 +123,7 @@ def _mass(problem: Problem, partition: Partition, check: Check) -> NDArray[np.fl
         boxes = (
             partition.inside_box(box, f"measure.boxes[{i}]") for i, box in enumerate(measure.boxes)
         )
-        inside = partition.mask(boxes, check)
+        inside = partition.mask(boxes, guard)
         if not inside.any():
             raise BadInput("no cell lies inside the boxes; enlarge them", "measure.boxes")
         mass[~inside] = 0.0
@@ -132,7 +132,7 @@ def _mass(problem: Problem, partition: Partition, check: Check) -> NDArray[np.fl
     return mass
 
 
-def _attractor(problem: Problem, partition: Partition, check: Check) -> NDArray[np.bool_]:
+def _attractor(problem: Problem, partition: Partition, guard: Guard) -> NDArray[np.bool_]:
     declared = problem.attractor
     points = (
         partition.around_point(
@@ -153,7 +153,7 @@ def _attractor(problem: Problem, partition: Partition, check: Check) -> NDArray[
                     f"{partition.names[k]}",
                     f"attractor.cells[{i}]",
                 )
-    mask = partition.mask(itertools.chain(points, boxes, cells), check)  # one at a time
+    mask = partition.mask(itertools.chain(points, boxes, cells), guard)  # one at a time
     if not mask.any():
         raise BadInput("no cell lies inside the boxes; enlarge them or give points", "attractor")
     return mask

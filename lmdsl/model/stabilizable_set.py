@@ -88,7 +88,7 @@ def stabilizable(
         lost = np.flatnonzero(inside & ~reached)
         if not len(lost):
             return Stabilizable(inside, alive, reaches, level, pair)
-        deadline.check("looking for the stabilizable set")
+        deadline.raise_if_over("looking for the stabilizable set")
         before = before or Predecessors.of(rows)
         cell = owner(pair_pointer)
         _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common.types import Check, Floats, Indices
+from lmdsl.common.types import Floats, Guard, Indices
 from lmdsl.formulas.enclosures import Jet
 from lmdsl.model.grid.partition import Partition
 from lmdsl.problem.problem import Problem
@@ -40,28 +40,28 @@ class TrueMap:
         return dict(zip(self.names, (*x, *u, *w), strict=True))
 
     def __call__(
-        self, x: Sequence[Any], u: Sequence[Any], w: Sequence[Any], check: Check | None = None
+        self, x: Sequence[Any], u: Sequence[Any], w: Sequence[Any], guard: Guard | None = None
     ) -> tuple[Floats, ...]:
         """Return the images by axis, not wrapped, each in the shape of what it depends on."""
-        return self.map(self.named(x, u, w), check)
+        return self.map(self.named(x, u, w), guard)
 
     def enclose(
-        self, x: Sequence[Jet], u: Sequence[Jet], w: Sequence[Jet], check: Check | None = None
+        self, x: Sequence[Jet], u: Sequence[Jet], w: Sequence[Jet], guard: Guard | None = None
     ) -> tuple[Jet, ...] | None:
         """Enclose images and derivatives on boxes; None where nothing encloses the map."""
         enclose = self.map.enclose
-        return None if enclose is None else enclose(self.named(x, u, w), check)
+        return None if enclose is None else enclose(self.named(x, u, w), guard)
 
     def images(
-        self, x: Floats, u: Floats, w: Sequence[Floats], check: Check | None = None
+        self, x: Floats, u: Floats, w: Sequence[Floats], guard: Guard | None = None
     ) -> Floats:
         """Return the images of states (r, d) under controls (r, p), not wrapped, shape (r, d)."""
         return np.stack(
-            [np.broadcast_to(y, len(x)) for y in self(list(x.T), list(u.T), w, check)], axis=-1
+            [np.broadcast_to(y, len(x)) for y in self(list(x.T), list(u.T), w, guard)], axis=-1
         )
 
     def step(
-        self, x: Floats, u: Floats, w: Sequence[Floats], check: Check | None = None
+        self, x: Floats, u: Floats, w: Sequence[Floats], guard: Guard | None = None
     ) -> tuple[Floats, Indices]:
         """Return the next states, wrapped or clipped, shape (r, d), and their cells, -1 outside."""
-        return self.partition.enter(self.images(x, u, w, check))
+        return self.partition.enter(self.images(x, u, w, guard))

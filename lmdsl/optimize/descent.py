@@ -17,7 +17,7 @@ from lmdsl.certificate.bounds import (
 )
 from lmdsl.certificate.sums import UNIT as UNIT
 from lmdsl.certificate.sums import rounded_down
-from lmdsl.common.types import Floats, Stop, never
+from lmdsl.common.types import Floats, TimeUp, never
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.vectors import over_cells, padded
@@ -50,7 +50,7 @@ def lower_until_below(
     gamma: float,
     cost: Floats | None,
     sweeps: int = 60,
-    stop: Stop = never,
+    time_up: TimeUp = never,
 ) -> Floats | None:
     """Lower x until x <= gamma P_a x + G_a holds for every pair; None where it does not settle.
 
@@ -59,7 +59,7 @@ def lower_until_below(
     """
     x = x.copy()
     for _ in range(sweeps):
-        if stop():
+        if time_up():
             break
         open_pairs = undecided(lp, x, gamma, cost)
         if open_pairs is None:
@@ -78,7 +78,7 @@ def lower_until_below(
 
 
 def raise_from_zero(
-    lp: StabilizationLP, gamma: float, cost: Floats, sweeps: int, stop: Stop = never
+    lp: StabilizationLP, gamma: float, cost: Floats, sweeps: int, time_up: TimeUp = never
 ) -> Floats:
     """Return value iterates from 0, rounded down: x <= T x holds along the whole way.
 
@@ -87,7 +87,7 @@ def raise_from_zero(
     x = np.zeros(lp.n)
     for _ in range(sweeps):
         y = np.maximum(x, backup_below(lp, x, gamma, cost))
-        if stop() or np.all(y - x <= 1e-12 * y):
+        if time_up() or np.all(y - x <= 1e-12 * y):
             return y
         x = y
     return x

@@ -20,8 +20,8 @@ from lmdsl.certificate.checks import (
     weighted,
 )
 from lmdsl.certificate.claims import Verified, Witness
-from lmdsl.certificate.judge import MANY, check
-from lmdsl.common.types import Floats, Pairs, Stop, never
+from lmdsl.certificate.judge import MANY, verdict
+from lmdsl.common.types import Floats, Pairs, TimeUp, never
 from lmdsl.machine import threads
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
@@ -45,7 +45,7 @@ def certify(
     policy: Pairs,
     tolerance: float,
     value: Floats | None = None,
-    stop: Stop = never,
+    time_up: TimeUp = never,
 ) -> Verified:
     """Make the vectors of claims 1 to 4 for a policy and check them.
 
@@ -57,22 +57,22 @@ def certify(
         Largest gap that counts as verified.
     value
         The policy's value as :func:`~evaluation.evaluate` gives it; made where missing.
-    stop
+    time_up
         Ends the work; what is not established by then is not claimed.
     """
     try:
-        witness, V = _first_try(lp, policy, tolerance, value, stop)
+        witness, V = _first_try(lp, policy, tolerance, value, time_up)
     except Stopped:
         witness, V = Witness(policy), None
-    proof = check(lp, witness, tolerance)
+    proof = verdict(lp, witness, tolerance)
     if V is not None and (proof.gap is None or proof.gap > tolerance):
-        witness = _tightened(lp, witness, V, tolerance, stop)
-        proof = check(lp, witness, tolerance)
+        witness = _tightened(lp, witness, V, tolerance, time_up)
+        proof = verdict(lp, witness, tolerance)
     return Verified(proof, witness)
 
 
 def _first_try(
-    lp: StabilizationLP, policy: Pairs, tolerance: float, value: Floats | None, stop: Stop
+    lp: StabilizationLP, policy: Pairs, tolerance: float, value: Floats | None, time_up: TimeUp
 ) -> tuple[Witness, Floats | None]:
     """Return vectors that serve as a rule, and the policy's value."""
     under, own = lp.under(policy), np.arange(lp.n)
@@ -80,18 +80,18 @@ def _first_try(
     growing = rows if lp.growth == lp.gamma else None
 
     def bounds_of_cost() -> tuple[Witness, Floats | None]:
-        w, d = evaluation.stability_vector(under, own, sharp=True, stop=stop, rows=growing)
+        w, d = evaluation.stability_vector(under, own, sharp=True, time_up=time_up, rows=growing)
         V = value
         if V is None:
-            V = evaluation.evaluate(under, own, transient=w is not None, stop=stop, rows=rows)
+            V = evaluation.evaluate(under, own, transient=w is not None, time_up=time_up, rows=rows)
         if V is None:
-            return Witness(policy, w, None, lower_vector(lp, None, tolerance, stop), None), None
+            return Witness(policy, w, None, lower_vector(lp, None, tolerance, time_up), None), None
         return Witness(
             policy, w, upper_vector(under, own, V, w, d), _guessed(under, V, tolerance)
         ), V
 
     def measure() -> Floats | None:
-        return _measure_vector(under, rows, stop)
+        return _measure_vector(under, rows, time_up)
 
     if value is not None:  # then the measure is finite too
         (witness, V), mu = threads.both(bounds_of_cost, measure, lp.n >= MANY)
@@ -102,7 +102,7 @@ def _first_try(
 
 
 def _tightened(
-    lp: StabilizationLP, witness: Witness, V: Floats, tolerance: float, stop: Stop
+    lp: StabilizationLP, witness: Witness, V: Floats, tolerance: float, time_up: TimeUp
 ) -> Witness:
     """Bring the bounds of the cost together, where the first try did not."""
     policy, V_up, W = witness.policy, witness.V_up, _scaled(lp, V)
@@ -113,31 +113,31 @@ def _tightened(
         if best <= tolerance:
             break
         try:
-            V_up = _lesser(lp, V_up, _upper_with_slack(lp, policy, slack, stop))
-            W = _greater(lp, W, _lower_with_slack(lp, policy, V, slack, stop))
+            V_up = _lesser(lp, V_up, _upper_with_slack(lp, policy, slack, time_up))
+            W = _greater(lp, W, _lower_with_slack(lp, policy, V, slack, time_up))
         except Stopped:
             break
         best = gap(lp, V_up, W)
-    if best > tolerance and not stop():
-        W = _greater(lp, W, lower_vector(lp, V, tolerance, stop))
+    if best > tolerance and not time_up():
+        W = _greater(lp, W, lower_vector(lp, V, tolerance, time_up))
     return replace(witness, V_up=V_up, W=W)
 
 
 def _upper_with_slack(
-    lp: StabilizationLP, policy: Pairs, slack: float, stop: Stop
+    lp: StabilizationLP, policy: Pairs, slack: float, time_up: TimeUp
 ) -> Floats | None:
-    V = evaluation.evaluate(lp, policy, lp.gamma * (1 + slack), stop=stop)
+    V = evaluation.evaluate(lp, policy, lp.gamma * (1 + slack), time_up=time_up)
     return V if V is not None and check_upper(lp, policy, V) else None
 
 
 def _lower_with_slack(
-    lp: StabilizationLP, policy: Pairs, V: Floats, slack: float, stop: Stop
+    lp: StabilizationLP, policy: Pairs, V: Floats, slack: float, time_up: TimeUp
 ) -> Floats | None:
     gamma = lp.gamma * (1 - slack)
-    value = evaluation.evaluate(lp, policy, gamma, start=V, stop=stop)
+    value = evaluation.evaluate(lp, policy, gamma, start=V, time_up=time_up)
     if value is None:
         return None
-    W = iteration.iterate(lp, policy, value, gamma, stop=stop, limit=20).value
+    W = iteration.iterate(lp, policy, value, gamma, time_up=time_up, limit=20).value
     return W if check_lower(lp, W) else None
 
 
@@ -173,7 +173,7 @@ def upper_vector(
 
 
 def lower_vector(
-    lp: StabilizationLP, V: Floats | None, tolerance: float, stop: Stop = never
+    lp: StabilizationLP, V: Floats | None, tolerance: float, time_up: TimeUp = never
 ) -> Floats:
     """Return W of claim 3, as large as can be proved from V; 0 always serves."""
     zero = np.zeros(lp.n)
@@ -183,12 +183,12 @@ def lower_vector(
         if W is not None:
             return W
         start = V * (1 - min(tolerance, 1e-6) / 4)
-        W = descent.lower_until_below(lp, start, lp.gamma, lp.cost, stop=stop)
+        W = descent.lower_until_below(lp, start, lp.gamma, lp.cost, time_up=time_up)
         if W is not None:
             candidates.append(W)
     if V is None or not candidates or gap(lp, V, candidates[0]) > tolerance:
         passes = max(LEAST_PASSES, min(MOST_PASSES, MOST_READ // max(len(lp.rows.target), 1)))
-        candidates.append(descent.raise_from_zero(lp, lp.gamma, lp.cost, passes, stop))
+        candidates.append(descent.raise_from_zero(lp, lp.gamma, lp.cost, passes, time_up))
     good = [W for W in candidates if check_lower(lp, W)]
     best: Floats = max(good, key=lambda W: weighted(lp, W), default=zero)
     return best
@@ -217,13 +217,13 @@ def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
     return None
 
 
-def _measure_vector(under: StabilizationLP, rows: Peeled, stop: Stop) -> Floats | None:
+def _measure_vector(under: StabilizationLP, rows: Peeled, time_up: TimeUp) -> Floats | None:
     def matrix() -> Any:
         return under.gamma * under.rows.matrix()
 
     # The residual counts in absolute terms where mu is small, summed over all cells.
     flat = 1e-2 * MEASURE_TOLERANCE / under.n
-    mu = equations.solve_transposed(rows, under.weight, matrix, flat=flat, stop=stop)
+    mu = equations.solve_transposed(rows, under.weight, matrix, flat=flat, time_up=time_up)
     if mu is not None and not check_measure(under, np.arange(under.n), mu)[1]:
-        mu = equations.solve_transposed(rows, under.weight, matrix, start=mu, stop=stop)
+        mu = equations.solve_transposed(rows, under.weight, matrix, start=mu, time_up=time_up)
     return mu

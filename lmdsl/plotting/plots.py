@@ -24,7 +24,7 @@ from lmdsl.machine import memory
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.discretization import control_values
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.sets import Regions
+from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.plotting import layers, overlays, runs
 from lmdsl.plotting.view import At, View, number, plain
@@ -79,7 +79,7 @@ def portrait(
         if count is not None:
             inputs.whole(count, name)
     partition = Partition.of(given)
-    attractor = Regions.of(given, partition).attractor
+    attractor = CellSets.of(given, partition).attractor
     view = View.of(partition, attractor, axes, at)
     u = runs.control_vector(given, control)
     lines = runs.is_ode(given)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lmdsl.backends import Backend, Solution
 from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Certificate, Verified, Witness
-from lmdsl.control.invariance import check
+from lmdsl.control.invariance import examine
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.partition import Partition
@@ -20,9 +20,9 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.results.polishing import _Outcome
-from lmdsl.results.report import Coverage, Seconds
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
+from lmdsl.results.summary import Coverage, Seconds
 
 UNKNOWN = 255
 """Status of cells of which nothing is known."""
@@ -85,7 +85,7 @@ class _Job:
     ) -> Result:
         if verified is None:
             witness = Witness(None)
-            verified = Verified(judge.check(self.lp, witness, self.tolerance), witness)
+            verified = Verified(judge.verdict(self.lp, witness, self.tolerance), witness)
         proof = replace(verified.certificate, reasons=(message,))
         return self._result(
             verified.witness,
@@ -169,7 +169,7 @@ class _Job:
             pairs=lp.K,
             attractor_cells=int(attractor.sum()),
             stabilizable_cells=n,
-            local_controller=None if local is None else check(lp.problem, local, self.finish),
+            local_controller=None if local is None else examine(lp.problem, local, self.finish),
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
             message=message,
             problem=lp.problem,

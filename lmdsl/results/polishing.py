@@ -46,7 +46,7 @@ def _polish(
     iteration: Iteration | None,
     start: Pairs,
     tolerance: float,
-    stop: Deadline,
+    deadline: Deadline,
 ) -> _Outcome:
     """Improve a backend's policy exactly until nothing is strictly better, then break ties.
 
@@ -54,7 +54,7 @@ def _polish(
     left as it is: a limit is not a license to go on.
     """
     if iteration is not None and solution.stop.success:  # it ends where polishing would begin
-        return _tidied(lp, iteration, tolerance, 0, None, stop)
+        return _tidied(lp, iteration, tolerance, 0, None, deadline)
     policy = _claimed(lp, solution)
     if policy is not None and not _usable(lp, policy, solution.value):
         policy = None
@@ -63,17 +63,17 @@ def _polish(
     guess = None if solution.policy is None else solution.value
     try:
         value = evaluation.evaluate(
-            lp, policy, start=guess, transient=lp.gamma >= 1, stop=stop.again()
+            lp, policy, start=guess, transient=lp.gamma >= 1, time_up=deadline.again()
         )
     except Stopped:
         value = None
     if value is None or solution.stop.limit:
         return _Outcome(policy, value, 0, None)
-    done = iterate(lp, policy, value, stop=stop)
+    done = iterate(lp, policy, value, time_up=deadline)
     gap_before = None
     if done.steps:
-        gap_before = certify(lp, policy, tolerance, value, stop.again()).certificate.gap
-    return _tidied(lp, done, tolerance, done.steps, gap_before, stop)
+        gap_before = certify(lp, policy, tolerance, value, deadline.again()).certificate.gap
+    return _tidied(lp, done, tolerance, done.steps, gap_before, deadline)
 
 
 def _tidied(
@@ -82,11 +82,11 @@ def _tidied(
     tolerance: float,
     steps: int,
     gap_before: float | None,
-    stop: Deadline,
+    deadline: Deadline,
 ) -> _Outcome:
     """Break ties; where that costs more than the tolerance the strict minimisers stay."""
     try:
-        tidy = ties.canonical(lp, done.policy, done.value, done.screen, stop)
+        tidy = ties.canonical(lp, done.policy, done.value, done.screen, deadline)
     except Stopped:
         tidy = done.policy
     if (tidy != done.policy).any() and _usable(lp, tidy, done.value):

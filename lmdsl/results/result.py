@@ -25,11 +25,11 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
-from lmdsl.model.sets import Regions
+from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
-from lmdsl.results.report import Coverage, Report
 from lmdsl.results.status import Cause
+from lmdsl.results.summary import Coverage, Summary
 from lmdsl.systems.named import NotStored
 
 if TYPE_CHECKING:
@@ -66,8 +66,8 @@ class CostFrom:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
-class Result(Report):
-    """The answer to a problem; see :class:`Report` for the scalars.
+class Result(Summary):
+    """The answer to a problem; see :class:`Summary` for the scalars.
 
     Attributes
     ----------
@@ -157,7 +157,7 @@ class Result(Report):
         """The user's m over all cells, shape (N,), sum 1 (all zero where none lies in C)."""
         weight = np.zeros(self.partition.size)
         on = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
-        weight[on] = Regions.of(self.problem, self.partition).weight(on)
+        weight[on] = CellSets.of(self.problem, self.partition).weight(on)
         freeze(weight)
         return weight
 

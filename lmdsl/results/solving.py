@@ -106,7 +106,7 @@ def solve(
 
 @dataclass(frozen=True)
 class _Wishes:
-    """What the caller of :func:`solve` asks for; ``late`` tells when the time is up."""
+    """What the caller of :func:`solve` asks for."""
 
     backend: Backend
     algorithm: str | None
@@ -232,4 +232,4 @@ def _refuse(lp: StabilizationLP, found: first_policy.Refused, tolerance: float) 
 
     w = lower_until_below(lp, found.w, lp.gamma, None)
     witness = Witness(None, found.w if w is None else w)
-    return Verified(judge.check(lp, witness, tolerance), witness)
+    return Verified(judge.verdict(lp, witness, tolerance), witness)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl.certificate.claims import Certificate, Witness
-from lmdsl.certificate.judge import CLAIMS, check, check_exactly
+from lmdsl.certificate.judge import CLAIMS, exact_verdict, verdict
 from lmdsl.common import inputs
 from lmdsl.common.json_values import jsonable
 from lmdsl.common.types import Progress
@@ -27,7 +27,7 @@ from lmdsl.model.assembly.transitions import estimate
 from lmdsl.model.discretization import noise_nodes, sample_points
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.rows import Rows, Shares
-from lmdsl.model.sets import Regions
+from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory import archive
@@ -126,9 +126,9 @@ def verify(
         The directory cannot be read.
     """
     deadline = Deadline.of(time_limit)
-    in_time = partial(deadline.check, "verifying")
-    exactly = partial(check_exactly, check=in_time)
-    judge = exactly if inputs.flag(exact, "exact") else check
+    in_time = partial(deadline.raise_if_over, "verifying")
+    exactly = partial(exact_verdict, guard=in_time)
+    judge = exactly if inputs.flag(exact, "exact") else verdict
     path = inputs.path(path)
     held = archive.read(path)
     result, reasons = held.result, list[str]()
@@ -234,7 +234,7 @@ def _policy(lp: StabilizationLP, result: Result) -> np.ndarray[Any, Any] | None:
 def _stored_model(path: str | os.PathLike[str], result: Result) -> StabilizationLP:
     """Rebuild the LP of a Python function from its saved rows."""
     status, problem = result.cell_status, result.problem
-    regions = Regions.of(problem, result.partition)
+    sets = CellSets.of(problem, result.partition)
     cells = np.flatnonzero(status == CellStatus.STABILIZED)
     n, K = len(cells), int(result.pairs or 0)
     memory.require(estimate(problem), "the saved rows")
@@ -267,7 +267,7 @@ def _stored_model(path: str | os.PathLike[str], result: Result) -> Stabilization
     return StabilizationLP(
         problem, result.partition, result.control_vectors, status, cells,
         small["pair_pointer"], small["control"], rows, small["cost"], problem.gamma,
-        regions.weight(cells),
+        sets.weight(cells),
     )  # fmt: skip
 
 

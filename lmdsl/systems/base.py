@@ -13,11 +13,10 @@ from functools import partial
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from lmdsl.common.strict_model import Declared, Positive, plain
-from lmdsl.common.types import Check
+from lmdsl.common.types import Floats, Guard
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.enclosures import Jet
 from lmdsl.formulas.language import Formula, parse
@@ -26,7 +25,6 @@ from lmdsl.formulas.program import Program
 from lmdsl.formulas.tracing import Recorder
 from lmdsl.machine.forking import cached_property
 
-Array = NDArray[np.float64]
 Substeps = Annotated[int, Field(strict=True, ge=1, le=1000), BeforeValidator(plain)]
 
 
@@ -65,10 +63,10 @@ def program(
 class StateMap(Protocol):
     """x+ = T(x, u, w) on named arrays, as every system compiles to one."""
 
-    def __call__(self, values: Mapping[str, Any], check: Check | None = None) -> tuple[Array, ...]:
+    def __call__(self, values: Mapping[str, Any], guard: Guard | None = None) -> tuple[Floats, ...]:
         """Return new arrays of images, one per state, each in the shape of what it depends on.
 
-        The arrays given broadcast against each other; ``check`` is called now and then, and may
+        The arrays given broadcast against each other; ``guard`` is called now and then, and may
         raise.
         """
 
@@ -78,7 +76,7 @@ class StateMap(Protocol):
 
     @property
     def enclose(self) -> Callable[..., tuple[Jet, ...]] | None:
-        """Encloses images and derivatives on boxes (jets by name, check); None where it cannot."""
+        """Encloses images and derivatives on boxes (jets by name, guard); None where it cannot."""
 
     @property
     def live(self) -> int:
@@ -177,17 +175,17 @@ class _RungeKutta:
             substeps * (4 * each + 14 * len(states)) for each in (field.effort, field.work)
         )
 
-    def __call__(self, values: Mapping[str, Any], check: Check | None = None) -> tuple[Array, ...]:
+    def __call__(self, values: Mapping[str, Any], guard: Guard | None = None) -> tuple[Floats, ...]:
         start = tuple(np.asarray(values[name], float) for name in self.states)
-        field = partial(self.field, check=check)
+        field = partial(self.field, guard=guard)
         with np.errstate(all="ignore"):
-            images: tuple[Array, ...] = self._advance(values, start, field)
+            images: tuple[Floats, ...] = self._advance(values, start, field)
         return images
 
     @cached_property
     def formulas(self) -> tuple[Formula, ...] | None:
         """The images written out as formulas, None where these are too long to be of use."""
-        nodes = sum(len(formula.steps) for formula in self.field.formulas)
+        nodes = sum(len(formula.subformulas) for formula in self.field.formulas)
         if max(self.effort, self.substeps * nodes) > MOST_WRITTEN:
             return None
         recorder = Recorder()
@@ -200,12 +198,12 @@ class _RungeKutta:
 
         return tuple(recorder.formula(image) for image in self._advance({}, start, slope))
 
-    def enclose(self, values: Mapping[str, Jet], check: Check | None = None) -> tuple[Jet, ...]:
+    def enclose(self, values: Mapping[str, Jet], guard: Guard | None = None) -> tuple[Jet, ...]:
         """Enclose the images and their derivatives on boxes."""
         start = tuple(values[name] for name in self.states)
         with np.errstate(all="ignore"):
             images: tuple[Jet, ...] = self._advance(
-                values, start, partial(self.field.enclose, check=check)
+                values, start, partial(self.field.enclose, guard=guard)
             )
         return images
 

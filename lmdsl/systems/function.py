@@ -13,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
-from lmdsl.common.types import Check
+from lmdsl.common.types import Floats, Guard
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.surroundings import restore_rounding
-from lmdsl.systems.base import Array, StateMap, System
+from lmdsl.systems.base import StateMap, System
 
 WHERE = "system.next"
 ALONE, OF_BLOCK = 8, 2
@@ -58,10 +58,10 @@ class FunctionSystem(System):
         self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
     ) -> StateMap:
         """See :meth:`System.compile`."""
-        return FunctionStep(self.next, tuple(states), dict(self.parameters))
+        return FunctionMap(self.next, tuple(states), dict(self.parameters))
 
 
-class FunctionStep:
+class FunctionMap:
     """The map of a :class:`FunctionSystem`, for some order of the states."""
 
     formulas = enclose = None  # nobody knows what it does, nor how long that takes
@@ -72,10 +72,10 @@ class FunctionStep:
     ) -> None:
         self.function, self.states, self.parameters = function, states, parameters
 
-    def __call__(self, values: Mapping[str, Any], check: Check | None = None) -> tuple[Array, ...]:
+    def __call__(self, values: Mapping[str, Any], guard: Guard | None = None) -> tuple[Floats, ...]:
         """Return the images as new arrays, each of the shape of the arguments it depends on."""
-        if check is not None:
-            check()
+        if guard is not None:
+            guard()
         return tuple(np.array(image, dtype=np.float64) for image in self._returned(values))
 
     def _returned(self, values: Mapping[str, Any]) -> list[Any]:
@@ -134,7 +134,7 @@ class Audit:
         It returns the same memory again, another answer, or another one to a sample by itself.
     """
 
-    def __init__(self, step: FunctionStep, values: Mapping[str, Any]) -> None:
+    def __init__(self, step: FunctionMap, values: Mapping[str, Any]) -> None:
         self.step = step
         self.values = {name: np.array(value, dtype=np.float64) for name, value in values.items()}
         kept, again = step._returned(self.values), step._returned(self.values)
@@ -154,7 +154,7 @@ class Audit:
         """Ask once more."""
         self._compare(self.step(self.values))
 
-    def _compare(self, images: tuple[Array, ...]) -> None:
+    def _compare(self, images: tuple[Floats, ...]) -> None:
         for name, a, b in zip(self.step.states, self.first, images, strict=True):
             shape = np.broadcast_shapes(a.shape, b.shape)
             a, b = np.broadcast_to(a, shape), np.broadcast_to(b, shape)
@@ -169,7 +169,7 @@ class Audit:
                 )
 
     def alone(
-        self, values: Mapping[str, Array], images: Sequence[Array], count: int = OF_BLOCK
+        self, values: Mapping[str, Floats], images: Sequence[Floats], count: int = OF_BLOCK
     ) -> None:
         """Ask for some of the samples that have these images one by one."""
         shape = np.broadcast_shapes(*(array.shape for array in values.values()))
@@ -194,7 +194,7 @@ class Audit:
                     )
 
 
-def _sample(values: Mapping[str, Array], k: tuple[int, ...]) -> str:
+def _sample(values: Mapping[str, Floats], k: tuple[int, ...]) -> str:
     shape = np.broadcast_shapes(*(array.shape for array in values.values()))
     return ", ".join(
         f"{name} = {float(np.broadcast_to(array, shape)[k])!r}" for name, array in values.items()
@@ -233,7 +233,7 @@ def _image(name: str, image: Any, shape: tuple[int, ...]) -> Any:
     return array
 
 
-def _spread(image: Array) -> float:
+def _spread(image: Floats) -> float:
     finite = image[np.isfinite(image)]
     return float(finite.max() - finite.min()) if finite.size else 0.0
 

@@ -16,7 +16,7 @@ from truth import CLAIMS
 import lmdsl as lm
 from lmdsl.certificate.bounds import exactly_below, holds_for_all
 from lmdsl.certificate.claims import Witness
-from lmdsl.certificate.judge import check, check_exactly
+from lmdsl.certificate.judge import exact_verdict, verdict
 from lmdsl.model.rows import Rows
 from lmdsl.optimize import witness
 from lmdsl.optimize.feasibility import first_policy
@@ -37,7 +37,7 @@ def solved():
 def judged(lp, witness, **changes):
     """Judge twice, fast and in rational arithmetic; the fast check may only be stricter."""
     changed = replace(witness, **changes)
-    fast, exact = check(lp, changed, 1e-6), check_exactly(lp, changed, 1e-6)
+    fast, exact = verdict(lp, changed, 1e-6), exact_verdict(lp, changed, 1e-6)
     for claim in ("stabilizing", "upper_bound", "lower_bound", "measure", "refusal"):
         assert getattr(exact, claim) >= getattr(fast, claim), claim
     for name, outward in (("cost", 1), ("contraction", 1), ("gap", 1), ("lower", -1)):
@@ -148,7 +148,7 @@ def test_a_policy_that_stays_is_never_stabilizing():
     lp = lm.compile(made(steps(1.0, cost="u")))
     stay = lp.pair_pointer[:-1].copy()
     for w in (np.ones(lp.n), np.arange(1.0, lp.n + 1), np.full(lp.n, 1e300)):
-        assert not check(lp, Witness(stay, w), 1e-6).stabilizing
+        assert not verdict(lp, Witness(stay, w), 1e-6).stabilizing
     assert evaluation.stability_vector(lp, stay) == (None, None)
 
 
@@ -161,22 +161,22 @@ def test_shares_that_round_below_one_prove_nothing():
     for k in range(lp.K):
         assert sum(share for _, share in lp.rows.exact(k)) == lp.rows.shares.total
     stay = lp.pair_pointer[:-1].copy()
-    assert not check(lp, Witness(stay, np.ones(lp.n)), 1e-6).stabilizing
+    assert not verdict(lp, Witness(stay, np.ones(lp.n)), 1e-6).stabilizing
 
 
 def test_refusal_needs_a_true_vector():
     lp = lm.compile(made(doubling(2.0)))
-    assert check(lp, Witness(None, np.ones(1)), 1e-6).refusal
+    assert verdict(lp, Witness(None, np.ones(1)), 1e-6).refusal
     lower = lm.compile(made(doubling(np.nextafter(2.0, 0))))
-    assert not check(lower, Witness(None, np.ones(1)), 1e-6).refusal
-    assert not check(lp, Witness(None, np.zeros(1)), 1e-6).refusal
-    assert not check(lp, Witness(None, -np.ones(1)), 1e-6).refusal
-    assert not check(lp, Witness(None, np.full(1, np.nan)), 1e-6).refusal
+    assert not verdict(lower, Witness(None, np.ones(1)), 1e-6).refusal
+    assert not verdict(lp, Witness(None, np.zeros(1)), 1e-6).refusal
+    assert not verdict(lp, Witness(None, -np.ones(1)), 1e-6).refusal
+    assert not verdict(lp, Witness(None, np.full(1, np.nan)), 1e-6).refusal
 
 
 def test_a_refusal_is_never_a_verification():
     lp = lm.compile(made(doubling(3.0)))
-    assert not check(lp, Witness(None, np.ones(1)), 1e-6).verified
+    assert not verdict(lp, Witness(None, np.ones(1)), 1e-6).verified
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
@@ -193,7 +193,7 @@ def test_claim_1_never_holds_for_an_unstable_policy(seed, gamma):
     if rho >= 1 + 1e-9:
         assert w is None
         guess = np.exp(rng.normal(size=lp.n))
-        assert not check(lp, Witness(pair, guess), 1e-6).stabilizing
+        assert not verdict(lp, Witness(pair, guess), 1e-6).stabilizing
     elif rho <= 1 - 1e-6:
         assert w is not None
 
@@ -243,7 +243,7 @@ def test_the_largest_doubles_are_refused_without_overflow():
     huge = np.full(lp.n, 1.7e308)
     for vectors in ({"mu": huge}, {"V_up": huge}, {"W": huge}, {"w": huge}):
         witness = replace(Witness(pair, ones, ones, ones, ones), **vectors)
-        for judge in (check, check_exactly):
+        for judge in (verdict, exact_verdict):
             assert not judge(lp, witness, 1e-6).verified
 
 
@@ -252,6 +252,6 @@ def test_vectors_of_another_length_prove_nothing():
     result = lm.solve(lp)
     pair = lp.pair_pointer[:-1] + result.control_index[lp.cells]
     for short in (np.ones(0), np.ones(1), np.ones(lp.n - 1), np.ones(lp.n + 1), np.ones((lp.n, 1))):
-        proof = check(lp, Witness(pair, short, short, short, short), 1e-6)
+        proof = verdict(lp, Witness(pair, short, short, short, short), 1e-6)
         assert not any(getattr(proof, name) for name in CLAIMS)
-        assert not check(lp, Witness(None, short), 1e-6).refusal
+        assert not verdict(lp, Witness(None, short), 1e-6).refusal

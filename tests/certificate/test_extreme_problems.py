@@ -16,7 +16,7 @@ from truth import truly
 import lmdsl as lm
 from lmdsl.certificate import sums
 from lmdsl.certificate.claims import Witness
-from lmdsl.certificate.judge import check, check_exactly
+from lmdsl.certificate.judge import exact_verdict, verdict
 from lmdsl.model import stabilizable_set
 from lmdsl.model.discretization import Nodes
 from lmdsl.model.rows import Rows, Shares
@@ -161,7 +161,7 @@ def test_a_refusal_that_rounds_to_infinity_proves_nothing():
     columns = np.flatnonzero(lp.control == 1)
     lp = replace(lp.part(columns, np.arange(lp.n)), gamma=0.9)
     for w in (np.full(lp.n, LARGEST), np.full(lp.n, 1.79e308), np.ones(lp.n)):
-        for judge_by in (check, check_exactly):
+        for judge_by in (verdict, exact_verdict):
             assert not judge_by(lp, Witness(None, w), 1e-6).refusal
             assert judge_by(replace(lp, gamma=1.0), Witness(None, w), 1e-6).refusal
 
@@ -201,7 +201,7 @@ def test_a_cost_beyond_the_doubles_is_no_bound():
     lp = lm.compile(made(one_axis(4, "0.5", False, "1")))
     lp = replace(lp, weight=np.array([0.5, 0.5, 2.0**-52]))
     V = np.full(lp.n, LARGEST)
-    for judge_by in (check, check_exactly):
+    for judge_by in (verdict, exact_verdict):
         proof = judge_by(lp, Witness(lp.pair_pointer[:-1], V, V, V, V), 1e-6)
         assert not proof.upper_bound
         assert proof.cost is None

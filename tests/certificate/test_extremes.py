@@ -19,7 +19,7 @@ from truth import CLAIMS, truly
 
 from lmdsl.certificate import sums
 from lmdsl.certificate.claims import Witness
-from lmdsl.certificate.judge import check, check_exactly
+from lmdsl.certificate.judge import exact_verdict, verdict
 
 TOLERANCE = 1e-6
 
@@ -146,7 +146,7 @@ def judge(rng):
     model = Model(rng)
     lp = model.lp
     choice, witness = drawn_witness(rng, model)
-    fast, exact = check(lp, witness, TOLERANCE), check_exactly(lp, witness, TOLERANCE)
+    fast, exact = verdict(lp, witness, TOLERANCE), exact_verdict(lp, witness, TOLERANCE)
     alone = told(model, choice, witness, exact)
     if witness.policy is None:
         w = witness.w.tolist()

@@ -92,7 +92,7 @@ def arrays(one, depth=3):
             yield from arrays(part, depth)
 
 
-PRIVATE = {"Options", "Solution", "Transitions", "Regions"}
+PRIVATE = {"Options", "Solution", "Transitions", "CellSets"}
 
 
 @NAMED

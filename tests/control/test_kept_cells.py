@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from local_controllers import ORBIT, linear_system, local_of
 from problems import doubling, made, standard_map
 
-from lmdsl.control.invariance import check
+from lmdsl.control.invariance import examine
 from lmdsl.formulas.enclosures import Jet, apply
 from lmdsl.formulas.intervals import Interval
 
@@ -36,7 +36,7 @@ def test_what_is_proved_holds_at_every_point(seed):
     data["local_controller"] = {"kind": "linear", "orbit": [[0] * d], "gain": gain}
     problem = made(data)
     local = local_of(problem)
-    found = check(problem, local)
+    found = examine(problem, local)
     # An independent count: cells none of whose many points, rim included, leaves A.
     partition = local.partition
     cells = np.flatnonzero(local.attractor)
@@ -65,7 +65,7 @@ def test_a_contraction_is_proved_and_an_expansion_is_not():
             data = linear_system(system, [[0.0], [0.0]])
             data["local_controller"] = {"kind": "linear", "orbit": [[0, 0]], "gain": {}}
             problem = made(data)
-            found = check(problem, local_of(problem))
+            found = examine(problem, local_of(problem))
             if count is not None:
                 assert found.proved == count
 
@@ -92,14 +92,14 @@ def test_a_long_enclosure_stops_in_time(monkeypatch):
                       "substeps": 1000}  # fmt: skip
     data["local_controller"] = {"kind": "constant"}
     problem = made(data)
-    found = check(problem, local_of(problem))
+    found = examine(problem, local_of(problem))
     assert (found.cells, found.proved, found.kept) == (1800, 0, 10_000)  # nothing is claimed
     data["system"] = {"kind": "map", "next": {"x0": "0.5*x0"}}
     data["state_box"]["x0"]["cells"] = 100_000
     problem = made(data)
-    assert check(problem, local_of(problem)).proved == 90_000
+    assert examine(problem, local_of(problem)).proved == 90_000
     monkeypatch.setattr("lmdsl.control.invariance.WORK", 1e5)
-    found = check(problem, local_of(problem))
+    found = examine(problem, local_of(problem))
     assert 0 < found.proved < found.cells  # what the work allowed
 
 
@@ -161,7 +161,7 @@ FINE = {"low": -3, "high": 5, "cells": 10_000_000}
 )
 def test_a_proof_is_of_every_state_and_of_the_map_as_computed(text, axis, cells, proved):
     problem = made(held(text, axis, cells))
-    found = check(problem, local_of(problem))
+    found = examine(problem, local_of(problem))
     assert found.proved == proved
     if proved == found.cells:
         assert found.kept == found.samples
@@ -218,7 +218,7 @@ def test_no_state_of_a_proved_cell_leaves(seed):
         data, cell = random_held(rng)
         problem = made(data)
         local = local_of(problem)
-        found = check(problem, local, samples=10)
+        found = examine(problem, local, samples=10)
         x = states_at(local.partition, cell, rng)
         images = problem.step()({"x": x[:, 0]})
         stays = (local.partition.locate(images) == cell).all()

@@ -10,7 +10,7 @@ from local_controllers import ORBIT, linear_system, local_of
 from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl.control.invariance import check
+from lmdsl.control.invariance import examine
 
 
 def test_the_regulator_of_a_fixed_point_solves_its_riccati_equation():
@@ -109,7 +109,7 @@ def test_a_python_function_is_differentiated_too():
     problem = made(data).replaced(system=lm.systems.FunctionSystem(next=step))
     function = local_of(problem)
     np.testing.assert_allclose(function.gain, formula.gain, rtol=1e-7)
-    found = check(problem, function)
+    found = examine(problem, function)
     assert (found.proved, found.kept) == (None, 10_000)
 
 
@@ -135,7 +135,7 @@ def test_noise_counts_at_every_node():
         values = [-amplitude, amplitude]
         data["noise"] = {"w": {"values": values, "weights": [0.5, 0.5]}}
         problem = made(data)
-        found = check(problem, local_of(problem))
+        found = examine(problem, local_of(problem))
         assert found.proved == proved
         assert (found.kept == 10_000) == (proved == 2)
 

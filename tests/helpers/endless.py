@@ -45,11 +45,11 @@ def local(nodes=5, substeps=2, cells=400):
 
 
 def checked(problem, *arguments, **more):
-    from lmdsl.control.invariance import check
+    from lmdsl.control.invariance import examine
     from lmdsl.model.grid.partition import Partition
     from lmdsl.model.local.controller import LocalController
-    from lmdsl.model.sets import Regions
+    from lmdsl.model.sets import CellSets
 
     partition = Partition.of(problem)
-    attractor = Regions.of(problem, partition).attractor
-    return check(problem, LocalController.of(problem, partition, attractor), *arguments, **more)
+    attractor = CellSets.of(problem, partition).attractor
+    return examine(problem, LocalController.of(problem, partition, attractor), *arguments, **more)

@@ -6,14 +6,14 @@ import numpy as np
 
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
-from lmdsl.model.sets import Regions
+from lmdsl.model.sets import CellSets
 
 ORBIT = [{"x": 0.25, "y": 0.5}, {"x": 0.75, "y": 0.5}]
 
 
 def local_of(problem):
     partition = Partition.of(problem)
-    return LocalController.of(problem, partition, Regions.of(problem, partition).attractor)
+    return LocalController.of(problem, partition, CellSets.of(problem, partition).attractor)
 
 
 def linear_system(A, B, cells=8, **more):

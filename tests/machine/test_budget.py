@@ -21,7 +21,7 @@ from lmdsl.machine import memory
 from lmdsl.model import discretization
 from lmdsl.model.assembly.transitions import estimate
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.sets import Regions
+from lmdsl.model.sets import CellSets
 
 HERE = Path(__file__).parents[1] / "helpers"
 linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
@@ -98,12 +98,12 @@ def test_boxes_are_resolved_one_at_a_time():
     )
     partition = Partition.of(problem)
     tracemalloc.start()
-    regions = Regions.of(problem, partition)
+    sets = CellSets.of(problem, partition)
     taken = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert taken < 40 * n
-    np.testing.assert_array_equal(np.flatnonzero(regions.attractor), np.arange(n // 2))
-    np.testing.assert_array_equal(np.flatnonzero(regions.avoid), np.arange(n // 2, 9 * n // 10))
+    np.testing.assert_array_equal(np.flatnonzero(sets.attractor), np.arange(n // 2))
+    np.testing.assert_array_equal(np.flatnonzero(sets.avoid), np.arange(n // 2, 9 * n // 10))
 
 
 def test_a_density_is_evaluated_in_parts():
@@ -112,7 +112,7 @@ def test_a_density_is_evaluated_in_parts():
     problem = made(steps(state_box=box, measure={"density": text}))
     partition = Partition.of(problem)
     tracemalloc.start()
-    mass = Regions.of(problem, partition).mass
+    mass = CellSets.of(problem, partition).mass
     taken = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert taken < 40 * cells + 10**7

@@ -41,7 +41,7 @@ def test_a_deadline_counts_down():
     assert late.left == 1e-9  # what a solver is given is positive
     assert Deadline.of(late) is late
     with pytest.raises(TimeLimitReached, match=r"time limit reached while knitting; raise the lim"):
-        late.check("knitting")
+        late.raise_if_over("knitting")
     interrupted = Deadline()
     interrupted.cancel()
     assert interrupted()
@@ -182,7 +182,7 @@ def test_verifying_ends_too_and_claims_no_more_than_it_proved(monkeypatch):
     whole = witness.certify(lp, pair, 1e-6)
     assert whole.certificate.stabilizing
     for n in (1, 2, 5, 20):
-        cut = witness.certify(lp, pair, 1e-6, stop=Asked(n))
+        cut = witness.certify(lp, pair, 1e-6, time_up=Asked(n))
         assert not cut.certificate.verified
         np.testing.assert_array_equal(cut.witness.policy, pair)
         for name in ("stabilizing", "upper_bound", "lower_bound", "measure"):

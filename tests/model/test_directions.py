@@ -102,7 +102,9 @@ def test_a_cycle_solves_a_flow_whatever_its_direction(shape, cycles, transposed)
     for signs in product((1, -1), repeat=len(shape)):
         M = drift(shape, signs)
         size = M.shape[0]
-        system = replace(gauss_seidel.System.of(M), directions=Directions(np.arange(size), shape))
+        system = replace(
+            gauss_seidel.SplitMatrix.of(M), directions=Directions(np.arange(size), shape)
+        )
         matrix = M
         if transposed:
             system, matrix = system.transposed(), M.T
@@ -116,7 +118,7 @@ def test_up_and_down_alone_takes_more():
     M = drift((12, 17), (1, -1))
     b = np.ones(M.shape[0])
     x = b.copy()
-    gauss_seidel.System.of(M).sweep(b, x, 4, enough=0.0)
+    gauss_seidel.SplitMatrix.of(M).sweep(b, x, 4, enough=0.0)
     assert np.abs(x - M @ x - b).max() > 1e-3
 
 
@@ -124,7 +126,9 @@ def test_two_halves_are_swept_in_the_same_directions(monkeypatch):
     monkeypatch.setattr(gauss_seidel, "SPLIT", 10)
     for signs in product((1, -1), repeat=2):
         M = drift((12, 17), signs)
-        system = replace(gauss_seidel.System.of(M), directions=Directions(np.arange(204), (12, 17)))
+        system = replace(
+            gauss_seidel.SplitMatrix.of(M), directions=Directions(np.arange(204), (12, 17))
+        )
         b = np.ones(204)
         x = b.copy()
         system.sweep(b, x, 12, enough=0.0)  # news crosses from one half to the other once
@@ -138,7 +142,8 @@ def test_the_core_keeps_the_directions_of_its_cells():
     outside = rng.random(99) < 0.4  # leads nowhere but out of the box; nothing leads there
     keep = sp.dia_array(((~outside).astype(float)[None], [0]), shape=(99, 99)).tocsr()
     system = replace(
-        gauss_seidel.System.of(sp.csr_array(M @ keep)), directions=Directions(np.arange(99), shape)
+        gauss_seidel.SplitMatrix.of(sp.csr_array(M @ keep)),
+        directions=Directions(np.arange(99), shape),
     )
     peeled = Peeled.of(system)
     assert 0 < len(peeled.core) < 99

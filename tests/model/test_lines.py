@@ -12,12 +12,12 @@ from lmdsl.model.assembly import lines, sampler
 from lmdsl.model.assembly.lines import Lines
 from lmdsl.model.assembly.sampler import Sampler
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.sets import Regions
+from lmdsl.model.sets import CellSets
 
 
 def sampled(problem):
     partition = Partition.of(problem)
-    return Sampler(problem, partition), Regions.of(problem, partition).free
+    return Sampler(problem, partition), CellSets.of(problem, partition).free
 
 
 def agree(found, expected):

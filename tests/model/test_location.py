@@ -12,7 +12,7 @@ from problems import doubling, made, steps
 
 import lmdsl as lm
 from lmdsl.model.assembly.sampler import Sampler
-from lmdsl.model.grid.axis import EDGE, MOST_TURNS, Axis
+from lmdsl.model.grid.axis import EDGE, MOST_TURNS, AxisCells
 from lmdsl.model.grid.partition import Partition
 
 MOST = 2**31 - 2
@@ -20,7 +20,7 @@ MOST = 2**31 - 2
 
 def axis_of(low, span, cells, periodic):
     high = low + span
-    return Axis(low, high, (high - low) / cells, float(cells), 1.0, periodic)
+    return AxisCells(low, high, (high - low) / cells, float(cells), 1.0, periodic)
 
 
 def partition_of(axis, clip=False):

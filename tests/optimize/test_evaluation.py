@@ -60,7 +60,7 @@ def test_a_leap_stays_above_its_equation(escape, make):
         b = rng.uniform(0.1, 1.0, n)
         x = above(M, b, rng)
         before, V = x.copy(), exact(M, b)
-        t = extrapolation.extrapolate(gauss_seidel.System.of(M), b, x)
+        t = extrapolation.extrapolate(gauss_seidel.SplitMatrix.of(M), b, x)
         assert t >= 1
         assert (x <= before * (1 + 1e-15)).all()
         assert (x >= V * (1 - 1e-12)).all()
@@ -71,7 +71,7 @@ def test_a_leap_removes_the_one_slow_mode():
     rng = np.random.default_rng(2)
     M = mixing(2000, 0.01, rng)
     b = rng.uniform(0.1, 1.0, 2000)
-    system, V = gauss_seidel.System.of(M), exact(M, b)
+    system, V = gauss_seidel.SplitMatrix.of(M), exact(M, b)
     start = above(M, b, rng)
     x, plain = start.copy(), start.copy()
     t = extrapolation.extrapolate(system, b, x)
@@ -84,7 +84,7 @@ def test_a_leap_is_not_taken_from_below_nor_at_the_solution():
     rng = np.random.default_rng(3)
     M = mixing(300, 0.01, rng)
     b = rng.uniform(0.1, 1.0, 300)
-    system, V = gauss_seidel.System.of(M), exact(M, b)
+    system, V = gauss_seidel.SplitMatrix.of(M), exact(M, b)
     below, swept = 0.5 * V, 0.5 * V
     assert extrapolation.extrapolate(system, b, below) == 1
     system.sweep(b, swept, extrapolation.SWEEPS)
@@ -99,7 +99,7 @@ def test_lifted_vectors_prove_that_a_mixing_set_is_left(escape):
         M, b = mixing(n, escape, rng), rng.uniform(0.1, 1.0, n)
         V = exact(M, b)
         for start in (np.zeros(n), V * rng.random(n), V, V * rng.uniform(0.5, 1.5, n)):
-            x, system = start.copy(), gauss_seidel.System.of(M)
+            x, system = start.copy(), gauss_seidel.SplitMatrix.of(M)
             system.sweep(b, x, 20)
             lifted = extrapolation.lift(system, b, x)
             # Near V only rounding is left to go by; the slower the escape, the more steps it takes.
@@ -114,7 +114,7 @@ def test_what_is_not_left_is_not_lifted(growth):
         M, b = mixing(n, 0.0, rng) * growth, np.ones(n)
         x = np.ones(n)
         if extrapolation.lift(
-            gauss_seidel.System.of(M), b, x
+            gauss_seidel.SplitMatrix.of(M), b, x
         ):  # what rounding made of it proves nothing
             assert not (x > b + M @ x).all()
 
@@ -122,7 +122,7 @@ def test_what_is_not_left_is_not_lifted(growth):
 def test_what_is_carried_along_is_swept_not_lifted():
     """No single mode is slow: somewhere the residual grows in 16 steps, though all mass leaves."""
     M, b = transport(400, np.random.default_rng(8)), np.ones(400)
-    system = gauss_seidel.System.of(M)
+    system = gauss_seidel.SplitMatrix.of(M)
     assert not extrapolation.lift(system, b, b.copy())
     assert system.sweep(b, b.copy(), 200)[1] < 1e-14
 
@@ -143,7 +143,7 @@ def test_a_small_core_alone_is_lifted(outside):
     inner = mixing(300, 1e-2, rng)
     into = sp.csr_array(rng.random((outside, 300)) * (rng.random((outside, 300)) < 0.01))
     M = sp.csr_array(sp.block_array([[inner, None], [into, sp.csr_array((outside, outside))]]))
-    peeled = Peeled.of(gauss_seidel.System.of(M))
+    peeled = Peeled.of(gauss_seidel.SplitMatrix.of(M))
     assert 250 < len(peeled.core) <= 300
     assert peeled.small == (outside == 900)
     b = np.ones(300 + outside)
@@ -206,12 +206,12 @@ def test_krylov_refuses_cells_that_stay_put_for_ever(own, size):
     M = sp.lil_array(mixing(1500, 0.1, rng))
     M[7, 7] = own
     M, b = sp.csr_array(M), np.full(1500, size)
-    assert equations._krylov(gauss_seidel.System.of(M), b, b.copy(), types.never) is None
+    assert equations._krylov(gauss_seidel.SplitMatrix.of(M), b, b.copy(), types.never) is None
     assert equations.solve(M, b) is None
 
 
 def test_krylov_finds_the_slow_mode_of_a_well_mixed_set():
     rng = np.random.default_rng(5)
     M, b = mixing(3000, 1e-6, rng), np.ones(3000)
-    guess = equations._krylov(gauss_seidel.System.of(M), b, b.copy(), types.never)
+    guess = equations._krylov(gauss_seidel.SplitMatrix.of(M), b, b.copy(), types.never)
     np.testing.assert_allclose(guess, exact(M, b), rtol=1e-6)

@@ -138,7 +138,7 @@ def test_solve_around_the_limit_of_a_long_chain(g):
 
 
 def test_ended_early():
-    found = gamma_bar.bracket(chain([9, 5]), stop=lambda: True)
+    found = gamma_bar.bracket(chain([9, 5]), time_up=lambda: True)
     assert found.low <= 10 / 9
     assert found.high == np.inf
     assert found.note == "the work was ended before the bracket closed"
@@ -186,7 +186,7 @@ def test_ended_anywhere_it_keeps_what_is_proved():
     whole = gamma_bar.bracket(lp)
     for most in range(0, 300, 23):
         left = iter(range(most))
-        found = gamma_bar.bracket(lp, stop=lambda left=left: next(left, None) is None)
+        found = gamma_bar.bracket(lp, time_up=lambda left=left: next(left, None) is None)
         assert found.low <= whole.high
         assert found.high >= whole.low
 

@@ -7,7 +7,7 @@ import pytest
 import scipy.sparse as sp
 
 from lmdsl.optimize.linear import classes, equations, gauss_seidel
-from lmdsl.optimize.linear.gauss_seidel import System
+from lmdsl.optimize.linear.gauss_seidel import SplitMatrix
 
 
 def sparse(n, rng, density=0.06, largest=0.9):
@@ -56,7 +56,7 @@ def test_where_something_is_paid():
     for _ in range(30):
         M, b = sparse(60, rng, 0.02), np.where(rng.random(60) < 0.05, 1.0, 0.0)
         reach = np.linalg.matrix_power((M.toarray() > 0) + np.eye(60), 60) > 0
-        np.testing.assert_array_equal(equations._pays(System.of(M), b), reach @ (b > 0))
+        np.testing.assert_array_equal(equations._pays(SplitMatrix.of(M), b), reach @ (b > 0))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
@@ -65,7 +65,7 @@ def test_each_half_sees_the_other_as_it_was_before_the_sweep(count, monkeypatch)
     rng = np.random.default_rng(count)
     for n in (2, 7, 50):
         M, b, x = sparse(n, rng, 0.5).toarray(), rng.random(n), rng.random(n)
-        system, own = System.of(sp.csr_array(M)), np.diag(M).copy()
+        system, own = SplitMatrix.of(sp.csr_array(M)), np.diag(M).copy()
         expected = x.copy()
         for sweep in range(count):
             before = expected.copy()
@@ -85,4 +85,4 @@ def test_sweeps_that_diverge_say_so(split, monkeypatch):
     monkeypatch.setattr(gauss_seidel, "SPLIT", split)
     M = sp.csr_array(np.array([[0.0, 3.0], [3.0, 0.0]]))
     x = np.ones(2)
-    assert System.of(M).sweep(np.ones(2), x, 2_000)[1] == np.inf
+    assert SplitMatrix.of(M).sweep(np.ones(2), x, 2_000)[1] == np.inf

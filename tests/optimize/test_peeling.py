@@ -19,7 +19,7 @@ from scipy.sparse.linalg import splu, spsolve
 from lmdsl.machine import threads
 from lmdsl.model import rows
 from lmdsl.optimize.linear import classes, equations, substitution
-from lmdsl.optimize.linear.gauss_seidel import System
+from lmdsl.optimize.linear.gauss_seidel import SplitMatrix
 from lmdsl.optimize.linear.policy_system import Slots
 from lmdsl.optimize.linear.substitution import Peeled
 
@@ -45,7 +45,7 @@ def cases(test):
 @cases
 def test_core_is_closed_and_holds_every_cycle(seed, n, cyclic):
     M = matrix(seed, n, min(cyclic, n))
-    peeled = Peeled.of(System.of(M))
+    peeled = Peeled.of(SplitMatrix.of(M))
     core = np.zeros(n, dtype=bool)
     core[peeled.core] = True
     off = M.toarray() * (1 - np.eye(n))
@@ -69,7 +69,7 @@ def test_solutions_agree_with_dense_ones(seed, n, cyclic):
     M = matrix(seed, n, min(cyclic, n))
     rng = np.random.default_rng(seed + 1)
     b = rng.random(n) * (rng.random(n) < 0.7)  # some exact zeros
-    peeled, whole = Peeled.of(System.of(M)), np.eye(n) - M.toarray()
+    peeled, whole = Peeled.of(SplitMatrix.of(M)), np.eye(n) - M.toarray()
     x = rng.random(n)
     assert equations.solve_from(peeled, b, x, lambda: M)
     np.testing.assert_allclose(x, np.linalg.solve(whole, b), rtol=1e-12, atol=1e-15)
@@ -89,7 +89,7 @@ def test_advancing_stays_on_its_side(seed, n, cyclic):
     for factor in (0.5, 2.0):  # below b + M x, and above
         x = factor * exact
         before = x.copy()
-        equations.advance(Peeled.of(System.of(M)), b, x, 2, 0.0, 0.0)
+        equations.advance(Peeled.of(SplitMatrix.of(M)), b, x, 2, 0.0, 0.0)
         ahead = b + M @ x
         if factor < 1:
             assert (x >= before * (1 - 1e-13)).all()
@@ -103,7 +103,7 @@ def test_cells_of_a_level_ascend_where_they_are_not_few_and_far_apart():
     n = 5000
     chains = np.arange(0, n, 100)  # 50 chains of 100 cells: each level has cells all over
     step = np.where(np.arange(n - 1) % 100 < 99, 0.5, 0.0)
-    peeled = Peeled.of(System.of(sp.csr_array(np.diag(step, 1))))
+    peeled = Peeled.of(SplitMatrix.of(sp.csr_array(np.diag(step, 1))))
     np.testing.assert_array_equal(peeled.levels, 50 * np.arange(1, 101))
     np.testing.assert_array_equal(peeled.order.reshape(100, 50), chains + np.arange(100)[:, None])
 
@@ -114,7 +114,7 @@ def test_a_walk_in_from_both_ends_is_peeled_pair_by_pair():
     step = np.sign(n // 2 - i)
     go = step != 0
     M = sp.csr_array((np.full(go.sum(), 0.5), (i[go], (i + step)[go])), shape=(n, n))
-    peeled, b = Peeled.of(System.of(M)), np.random.default_rng(0).random(n)
+    peeled, b = Peeled.of(SplitMatrix.of(M)), np.random.default_rng(0).random(n)
     assert not len(peeled.core)
     assert len(peeled.levels) == n // 2 + 1
     assert len(peeled._spans) == 1  # one sweep, however many levels
@@ -127,7 +127,7 @@ def test_a_walk_in_from_both_ends_is_peeled_pair_by_pair():
 @pytest.mark.parametrize("workers", [1, 2])
 def test_large_levels_in_several_threads(monkeypatch, many, workers):
     M = matrix(3, 300, 5)
-    peeled, b = Peeled.of(System.of(M)), np.random.default_rng(0).random(300)
+    peeled, b = Peeled.of(SplitMatrix.of(M)), np.random.default_rng(0).random(300)
     monkeypatch.setattr(substitution, "MANY", many)
     monkeypatch.setattr(threads, "count", lambda: workers)
     x = np.linalg.solve(np.eye(300) - M.toarray(), b)
@@ -135,12 +135,12 @@ def test_large_levels_in_several_threads(monkeypatch, many, workers):
     assert peeled.substitute(b, y)
     np.testing.assert_allclose(y, x, rtol=1e-12)
     never = sp.csr_array(np.eye(300))
-    assert not Peeled.of(System.of(never)).substitute(np.ones(300), np.ones(300))
+    assert not Peeled.of(SplitMatrix.of(never)).substitute(np.ones(300), np.ones(300))
 
 
 def test_a_system_without_cycles_is_solved_at_once():
     M = matrix(0, 200, 0)
-    peeled = Peeled.of(System.of(M))
+    peeled = Peeled.of(SplitMatrix.of(M))
     assert not len(peeled.core)
     x = np.zeros(200)
     assert equations.advance(peeled, np.ones(200), x, 1, 0.0, 0.0) == 0.0
@@ -150,7 +150,7 @@ def test_a_system_without_cycles_is_solved_at_once():
 @pytest.mark.parametrize("own", [1.0, 1.5])
 def test_staying_for_ever_has_no_solution_where_something_is_paid(own):
     M = sp.csr_array(np.array([[own, 0.0], [0.5, 0.0]]))
-    peeled = Peeled.of(System.of(M))
+    peeled = Peeled.of(SplitMatrix.of(M))
     for b in (np.array([1e-200, 1.0]), np.array([1.0, 0.0])):
         assert not equations.solve_from(peeled, b, b.copy(), lambda: M)
         assert equations.advance(peeled, b, b.copy(), 9, 0.0, 0.0) == np.inf
@@ -161,7 +161,7 @@ def test_staying_for_ever_has_no_solution_where_something_is_paid(own):
 
 def test_a_growing_cycle_has_no_solution():
     M = sp.csr_array(np.array([[0.0, 1.1, 0.0], [1.0, 0.0, 0.0], [0.5, 0.5, 0.0]]))
-    peeled = Peeled.of(System.of(M))
+    peeled = Peeled.of(SplitMatrix.of(M))
     assert list(peeled.core) == [0, 1]
     assert not equations.solve_from(peeled, np.ones(3), np.ones(3), lambda: M)
 
@@ -184,7 +184,7 @@ def test_well_mixed_systems_are_solved_without_factors(monkeypatch, zeros, scale
     exact = spsolve(sp.eye_array(1200, format="csc") - M.tocsc(), b)
     monkeypatch.setattr(classes, "solve_by_class", lambda *_: pytest.fail("it was factored"))
     np.testing.assert_allclose(equations.solve(M, b), exact, rtol=1e-9)
-    mu = equations.solve_transposed(Peeled.of(System.of(M)), b, lambda: M)
+    mu = equations.solve_transposed(Peeled.of(SplitMatrix.of(M)), b, lambda: M)
     np.testing.assert_allclose(mu - M.T @ mu, b, atol=1e-11 * mu.max())
 
 

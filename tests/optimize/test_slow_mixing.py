@@ -66,7 +66,7 @@ def test_descending_stays_above_the_equation(escape, make):
     b = rng.uniform(0.5, 2.0, 400)
     x = above(M, b, rng)
     before = x.copy()
-    assert equations.descend(Peeled.of(gauss_seidel.System.of(M)), b, x, 1e-6)
+    assert equations.descend(Peeled.of(gauss_seidel.SplitMatrix.of(M)), b, x, 1e-6)
     assert (x <= before).all()
     assert (x >= (b + M @ x) * (1 - 1e-12)).all()
     np.testing.assert_allclose(x, exact(M, b), rtol=1e-3)
@@ -77,7 +77,8 @@ def test_descending_refuses_what_has_no_solution():
     M, b = mixing(300, -0.01, rng), np.ones(300)
     x = np.full(300, 1e9)
     assert (
-        not equations.descend(Peeled.of(gauss_seidel.System.of(M)), b, x, 1e-6) or (x == 1e9).all()
+        not equations.descend(Peeled.of(gauss_seidel.SplitMatrix.of(M)), b, x, 1e-6)
+        or (x == 1e9).all()
     )
 
 

@@ -91,6 +91,20 @@ def test_no_room_takes_the_name_of_a_function():
     }
 
 
+def test_a_class_name_stands_for_one_class():
+    """Of the whole package, private names and names of types included."""
+    places: dict[str, list[str]] = {}
+    for module, path in house.modules(PACKAGE).items():
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(module)
+            if isinstance(node, ast.Assign) and isinstance(node.value, ast.Subscript):
+                for target in node.targets:
+                    if isinstance(target, ast.Name) and not target.id.isupper():
+                        places.setdefault(target.id, []).append(module)
+    assert not {name: found for name, found in places.items() if len(found) > 1}
+
+
 def test_the_plan_lists_every_package_with_its_sentence():
     plan = (PACKAGE.parent / "docs/design.md").read_text()
     table = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", plan, re.MULTILINE))

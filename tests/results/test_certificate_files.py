@@ -16,7 +16,7 @@ from random_problems import random_problem
 
 import lmdsl as lm
 from lmdsl.certificate.claims import Witness
-from lmdsl.certificate.judge import check, check_exactly
+from lmdsl.certificate.judge import exact_verdict, verdict
 from lmdsl.cli import main
 from lmdsl.results.exports import export_certificate
 
@@ -63,7 +63,7 @@ def test_a_large_measure_counts_relative_to_its_size(tmp_path):
         on = result.lp.cells
         pair = np.array([result.lp.column(c, result.control_index[c]) for c in on])
         witness = Witness(pair, mu=measure[on])
-        for judge in (check, check_exactly):
+        for judge in (verdict, exact_verdict):
             assert judge(result.lp, witness, 1e-6).measure == holds
         said = checked(exported(spoiled, tmp_path))[1]
         assert ("claim 4 measure: holds" in said) == holds, said
@@ -186,7 +186,7 @@ def test_a_result_restricted_to_gamma(tmp_path):
 def test_the_largest_example_of_the_paper_takes_seconds(tmp_path):
     path = exported(lm.solve(made(standard_map(50))), tmp_path)
     done = subprocess.run(
-        [sys.executable, "-I", "-S", SCRIPT, path], capture_output=True, timeout=600, check=False
+        [sys.executable, "-I", "-S", SCRIPT, path], capture_output=True, timeout=600, verdict=False
     )
     assert done.returncode == 0
 

@@ -14,7 +14,7 @@ from lmdsl.cli import main, solving
 from lmdsl.control.simulation import Simulation
 from lmdsl.machine.deadline import Deadline
 from lmdsl.results import result
-from lmdsl.results.report import Coverage
+from lmdsl.results.summary import Coverage
 
 PENDULUM = {
     "format": "lmdsl/1",

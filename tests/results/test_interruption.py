@@ -110,7 +110,7 @@ import os, sys
 from lmdsl.cli import output
 from lmdsl.__main__ import run
 told = int(sys.argv.pop(1))
-output.Progress.__call__ = lambda *_: os.write(told, b".")
+output.ProgressLine.__call__ = lambda *_: os.write(told, b".")
 sys.exit(run())
 """
 
@@ -320,7 +320,7 @@ def test_a_time_limit_holds_within_the_sweeps_of_one_evaluation(monkeypatch):
         return next(asked) >= 100
 
     with pytest.raises(deadline.Stopped):
-        evaluation.evaluate(lp, pair, stop=late)
+        evaluation.evaluate(lp, pair, time_up=late)
     assert next(asked) < 105
     assert isinstance(first_policy.stabilizing(lp, late), first_policy.Undecided)
     assert stopping.optimal_stopping(lp, 1.1, np.ones(lp.n), pair, np.ones(4, bool), late) is None

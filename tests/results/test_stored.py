@@ -19,7 +19,7 @@ from lmdsl.common import arrays
 from lmdsl.results.directory import reading
 from lmdsl.results.directory.audit import NOT_CLAIMED
 from lmdsl.results.directory.certificate_file import CertificateFile
-from lmdsl.results.report import Report
+from lmdsl.results.summary import Summary
 from lmdsl.systems import FunctionSystem
 
 ORBIT = [[0.25, 0.5], [0.75, 0.5]]
@@ -115,7 +115,7 @@ def test_what_a_certificate_says_is_what_a_result_holds():
     held = {field.name for field in fields(lm.Result)} | {"beyond_gamma"}
     keys = {*CertificateFile.model_fields}
     assert keys - apart <= held
-    assert {field.name for field in fields(Report)} - {"simulation"} <= keys
+    assert {field.name for field in fields(Summary)} - {"simulation"} <= keys
 
 
 # True statements that say less, and are accepted.

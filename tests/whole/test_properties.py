@@ -19,7 +19,7 @@ from truth import CLAIMS, SAMPLES, truly
 
 import lmdsl as lm
 from lmdsl.certificate.claims import Witness
-from lmdsl.certificate.judge import check, check_exactly
+from lmdsl.certificate.judge import exact_verdict, verdict
 
 GAMMAS = [0.9, 1.0, 1.0, 1.02, 1.1]
 
@@ -315,7 +315,7 @@ def test_no_false_claim_passes():
                         witness = replace(witness, policy=pair)
                     else:
                         witness = replace(witness, **{name: spoil(rng, getattr(witness, name))})
-            fast, exact = check(a.lp, witness, 1e-6), check_exactly(a.lp, witness, 1e-6)
+            fast, exact = verdict(a.lp, witness, 1e-6), exact_verdict(a.lp, witness, 1e-6)
             choice = witness.policy - a.lp.pair_pointer[:-1]
             truth = truly(model, gamma, a.lp.weight, choice.tolist(), witness)
             for name in CLAIMS:

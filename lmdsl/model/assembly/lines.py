@@ -21,7 +21,7 @@ from lmdsl.formulas.operations import PLAIN
 from lmdsl.formulas.program import Instruction, Program
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.assembly.merging import add_cost, settle_cost
-from lmdsl.model.grid.axis import Axis, circle, interval
+from lmdsl.model.grid.axis import AxisCells, circle, interval
 
 Integers = NDArray[np.int64]
 
@@ -91,7 +91,7 @@ class Lines:
         self,
         values: Mapping[str, Any],
         shape: tuple[int, int, int, int],
-        axes: Sequence[Axis],
+        axes: Sequence[AxisCells],
         clip: bool,
         weights: Floats | None,
     ) -> tuple[Floats | None, Floats | None]:
@@ -275,7 +275,7 @@ def _load(flat, at, step, line):  # type: ignore[no-untyped-def]
 
 @kernel
 def _locate(image, axis, clip, index):  # type: ignore[no-untyped-def]
-    """Add the indices on one axis; ``axis`` has the fields of :class:`Axis`."""
+    """Add the indices on one axis; ``axis`` has the fields of :class:`AxisCells`."""
     low, high, width, cells, stride = axis[0], axis[1], axis[2], axis[3], axis[4]
     if axis[5] > 0.0:
         circle(image, low, high, width, cells, stride, index)

@@ -26,7 +26,7 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.base import StateMap
-from lmdsl.systems.function import Audit, FunctionStep
+from lmdsl.systems.function import Audit, FunctionMap
 
 CHUNK = 2**17
 """Samples evaluated at a time: few enough to stay in cache, many enough to keep threads apart."""
@@ -88,7 +88,7 @@ class Sampler:
         Number of samples S of a pair; sample s is point ``s // nodes`` and node ``s % nodes``.
     controls
         Control vectors, shape (M, p).
-    check
+    guard
         Raises once the deadline has passed.
     true_map
         The map, by axis.
@@ -112,8 +112,8 @@ class Sampler:
         step = _written(problem, self.true_map.map)
         cost = Program([problem.cost()], problem.system.constants())
         self._images, self._costs = _split(problem, step, cost)
-        self.check = check = partial(Deadline.of(deadline).check, doing)
-        self.step, self.cost = partial(step, check=check), partial(cost, check=check)
+        self.guard = guard = partial(Deadline.of(deadline).raise_if_over, doing)
+        self.step, self.cost = partial(step, guard=guard), partial(cost, guard=guard)
         self._audit: Audit | None = None
         self._offset = np.ascontiguousarray(self.points.T)[:, :, None]
         self._control = np.ascontiguousarray(self.controls.T)
@@ -149,7 +149,7 @@ class Sampler:
         From then on, of every block some samples are asked for again.
         """
         step = self.step.func
-        if not isinstance(step, FunctionStep) or not len(cells):
+        if not isinstance(step, FunctionMap) or not len(cells):
             return None
         width = min(len(self.controls), FEW)
         count = max(1, min(len(cells), FEW, CHUNK // (self.samples * width)))

@@ -28,7 +28,7 @@ from lmdsl.model.assembly.merging import merge, merge_one, tile
 from lmdsl.model.assembly.sampler import CHUNK, Block, Sampler
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.rows import Rows, Shares, code_type
-from lmdsl.model.sets import Regions
+from lmdsl.model.sets import CellSets
 from lmdsl.problem.problem import Problem
 
 
@@ -38,7 +38,7 @@ class Transitions:
 
     Attributes
     ----------
-    regions
+    sets
         The cells outside A and Z, on which pairs are formed.
     pair_pointer
         Shape (F + 1,): pairs of the i-th free cell are ``pair_pointer[i]:pair_pointer[i + 1]``.
@@ -50,7 +50,7 @@ class Transitions:
         Weighted mean of the stage cost over the samples of each pair.
     """
 
-    regions: Regions
+    sets: CellSets
     pair_pointer: NDArray[np.int64]
     control: NDArray[np.int32]
     rows: Rows
@@ -84,7 +84,7 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     S = min(discretization.sample_points(problem) * discretization.node_count(problem), 10**40)
     entry = 4 + (1 if S <= 2**8 else 2 if S <= 2**16 else 4)
     pairs = M * pilot.admissible
-    # Of a pair the row, its end, control and cost; of a cell the regions, levels and weights.
+    # Of a pair the row, its end, control and cost; of a cell the sets, levels and weights.
     model = N * (64 + pairs * (21 + pilot.entries * entry))
     copied = (
         pairs * (28 + pilot.entries * entry) if pilot.admissible < 1 else 0
@@ -180,10 +180,10 @@ def assemble(
     """
     require_least(problem)
     deadline = unless_short(problem, Deadline.of(deadline))
-    regions = Regions.of(problem, partition, deadline)
+    sets = CellSets.of(problem, partition, deadline)
     sampler = Sampler(problem, partition, deadline)
     try:
-        return _assembled(problem, regions, sampler, progress, deadline)
+        return _assembled(problem, sets, sampler, progress, deadline)
     except BaseException:
         deadline.cancel()  # threads that help may be far from the end of their blocks
         raise
@@ -191,15 +191,15 @@ def assemble(
 
 def _assembled(
     problem: Problem,
-    regions: Regions,
+    sets: CellSets,
     sampler: Sampler,
     progress: Progress | None,
     deadline: Deadline,
 ) -> Transitions:
-    audit = sampler.audit(regions.free)
-    pilot = _pilot(sampler, regions)
+    audit = sampler.audit(sets.free)
+    pilot = _pilot(sampler, sets)
     memory.require(estimate(problem, pilot), "estimated from a few cells")
-    F, M = len(regions.free), len(sampler.controls)
+    F, M = len(sets.free), len(sampler.controls)
     shares = Shares.of(len(sampler.points), sampler.nodes)
     pairs = int(F * M * min(1.0, 1.05 * pilot.admissible)) + M
     room = int(pairs * 1.05 * pilot.entries) + sampler.samples
@@ -212,7 +212,7 @@ def _assembled(
     # glibc returns the memory of a block to the system, to fault it in again for the next one,
     # unless it has seen more than that freed at once.
     np.empty(2**20)
-    assembler, parts = _Assembler(sampler, regions), sampler.blocks(regions.free)
+    assembler, parts = _Assembler(sampler, sets), sampler.blocks(sets.free)
     for block, rows in threads.in_order(assembler, parts, deadline.cancel):
         pair_pointer[1 + block.first : 1 + block.first + len(block.cells)] += rows.per_cell
         pointer.append(rows.end + target.used)
@@ -221,13 +221,13 @@ def _assembled(
         target.append(rows.target)
         code.append(rows.code)
         done += block.lanes
-        deadline.check("compiling")
+        deadline.raise_if_over("compiling")
         if progress:
             progress("transitions", done / (F * M))
     if audit is not None:
         audit.again()
     return Transitions(
-        regions=regions,
+        sets=sets,
         pair_pointer=np.cumsum(pair_pointer, out=pair_pointer),
         control=control.array(),
         rows=Rows(pointer.array(), target.array(), code.array(), shares, F),
@@ -266,13 +266,13 @@ class _BlockRows(NamedTuple):
 class _Assembler:
     """Computes the rows of blocks; it may be called from several threads at once."""
 
-    def __init__(self, sampler: Sampler, regions: Regions) -> None:
-        self.sampler, self.number = sampler, regions.number
+    def __init__(self, sampler: Sampler, sets: CellSets) -> None:
+        self.sampler, self.number = sampler, sets.number
         nodes = sampler.nodes
         sizes = np.bincount(nodes.group) * len(sampler.points)
         self.first_code = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
         self.bits = int(nodes.group.max()).bit_length()
-        wide = (len(regions.free) + 1) << self.bits > 2**31
+        wide = (len(sets.free) + 1) << self.bits > 2**31
         self.key = np.int64 if wide else np.int32
         self.group = np.tile(nodes.group, len(sampler.points)).astype(self.key)
 
@@ -287,7 +287,7 @@ class _Assembler:
         high, wide = tile(block.cells_last, block.width)
         high = min(high, len(block.cells))
         if lanes == 1 and sampler.samples >= MANY:
-            sampler.check()
+            sampler.guard()
             row = merge_one(index, self.number, self.group, self.bits, self.first_code)
             entries = len(row[0])
             target[:entries], code[:entries] = row
@@ -311,29 +311,29 @@ class _Assembler:
         )
 
 
-def _pilot(sampler: Sampler, regions: Regions) -> Pilot:
+def _pilot(sampler: Sampler, sets: CellSets) -> Pilot:
     """Sample a few cells spread over the box."""
-    if not len(regions.free):
+    if not len(sets.free):
         return Pilot()
-    F, M, S = len(regions.free), len(sampler.controls), sampler.samples
+    F, M, S = len(sets.free), len(sampler.controls), sampler.samples
     count = min(64, F)
-    cells = regions.free[np.linspace(0, F - 1, count).astype(int)]
+    cells = sets.free[np.linspace(0, F - 1, count).astype(int)]
     width = max(1, min(M, 4 * CHUNK // (count * S)))
     blocks = [Block(0, cells, (0, M))]
     if width < M:  # another part of the controls for every cell
         starts = np.linspace(0, M - width, count).astype(int).tolist()
         blocks = [Block(0, cells[i : i + 1], (a, a + width)) for i, a in enumerate(starts)]
-    lengths = np.concatenate([_lengths(sampler, regions, block) for block in blocks])
+    lengths = np.concatenate([_lengths(sampler, sets, block) for block in blocks])
     kept = lengths > 0
     return Pilot(float(kept.mean()), float(lengths[kept].mean()) if kept.any() else 1.0)
 
 
-def _lengths(sampler: Sampler, regions: Regions, block: Block) -> NDArray[np.int64]:
+def _lengths(sampler: Sampler, sets: CellSets, block: Block) -> NDArray[np.int64]:
     """Return the number of targets of every pair of a block, 0 where inadmissible."""
     index = sampler.images(block, sampler.values(block))
-    sampler.check()
+    sampler.guard()
     leaves = np.isnan(index)
-    target = regions.number[np.where(leaves, 0.0, index).astype(np.int64)]
+    target = sets.number[np.where(leaves, 0.0, index).astype(np.int64)]
     target[leaves] = -1
     rows = np.sort(target, axis=1)
     lengths: NDArray[np.int64] = (np.diff(rows, axis=1) != 0).sum(axis=1) + 1

@@ -25,7 +25,7 @@ MOST_TURNS = 2.0**20
 ROUNDING = 2.0**-53
 
 
-class Axis(NamedTuple):
+class AxisCells(NamedTuple):
     """One axis in plain numbers; ``stride`` cells of the box lie between neighbours on it."""
 
     low: float

@@ -20,7 +20,7 @@ from lmdsl.common.frozen import Frozen
 from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.forking import cached_property
-from lmdsl.model.grid.axis import EDGE, Axis
+from lmdsl.model.grid.axis import EDGE, AxisCells
 from lmdsl.problem.problem import Problem
 
 MAX_CELLS = 2**31 - 2
@@ -203,10 +203,10 @@ class Partition(Frozen):
         return self.low + first * self.width, self.low + last * self.width, owner
 
     @cached_property
-    def axes(self) -> tuple[Axis, ...]:
+    def axes(self) -> tuple[AxisCells, ...]:
         """The axes in plain numbers."""
         return tuple(
-            Axis(
+            AxisCells(
                 float(self.low[k]),
                 float(self.high[k]),
                 float(self.width[k]),
@@ -236,15 +236,15 @@ class Partition(Frozen):
     def mask(
         self,
         blocks: Iterable[tuple[Indices | range, ...]],
-        check: Callable[[], object] = lambda: None,
+        guard: Callable[[], object] = lambda: None,
     ) -> Bools:
         """Return which cells lie in a union of blocks (on each axis a range, or an index array).
 
-        ``check`` is called before every block; it may raise.
+        ``guard`` is called before every block; it may raise.
         """
         inside = np.zeros(self.shape, dtype=np.bool_)
         for block in blocks:
-            check()
+            guard()
             spans = [slice(a.start, a.stop) for a in block if isinstance(a, range)]
             inside[tuple(spans) if len(spans) == len(block) else np.ix_(*block)] = True
         return inside.ravel()

@@ -100,10 +100,10 @@ class LocalController(Frozen):
         gain, multiplier = np.zeros((*control.shape, partition.dimension)), None
         if not isinstance(declared, ConstantControl):
             _inside(orbit, partition, attractor)
-            check = partial(Deadline.of(deadline).check, "linearising along the orbit")
+            guard = partial(Deadline.of(deadline).raise_if_over, "linearising along the orbit")
             reach = linearisation.reach(low, high, control)
             true_map = TrueMap(problem, partition)
-            A, B = linearisation.along(true_map, orbit, control, reach, check)
+            A, B = linearisation.along(true_map, orbit, control, reach, guard)
             gain = _gain(declared, problem, A, B, partition.width, reach)
             multiplier = _multiplier(A, B, gain / reach[:, None] * partition.width)
         return cls(partition, attractor, orbit, control, gain, low, high, multiplier)

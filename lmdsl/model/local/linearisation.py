@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common.types import Check, Floats
+from lmdsl.common.types import Floats, Guard
 from lmdsl.errors import BadInput
 from lmdsl.formulas.enclosures import Jet
 from lmdsl.formulas.intervals import Interval
@@ -26,7 +26,7 @@ def points(orbit: Sequence[Any], partition: Partition) -> Floats:
 
 
 def along(
-    true_map: TrueMap, orbit: Floats, control: Floats, reach: Floats, check: Check
+    true_map: TrueMap, orbit: Floats, control: Floats, reach: Floats, guard: Guard
 ) -> tuple[Floats, Floats]:
     """Return the derivatives along an orbit (q, d) under controls (q, p); NaN at a kink.
 
@@ -42,16 +42,16 @@ def along(
         The map does not send each point to the next.
     """
     noise = [np.full(len(orbit), mean) for mean in noise_nodes(true_map.problem).mean()]
-    _refuse_unless_orbit(true_map, orbit, control, noise, check)
+    _refuse_unless_orbit(true_map, orbit, control, noise, guard)
     unit, d = np.concatenate([true_map.partition.width, reach]), orbit.shape[1]
-    slopes = _jacobian(true_map, orbit, control, noise, unit, check)
+    slopes = _jacobian(true_map, orbit, control, noise, unit, guard)
     return slopes[:, :, :d], slopes[:, :, d:]
 
 
 def _refuse_unless_orbit(
-    true_map: TrueMap, orbit: Floats, control: Floats, noise: list[Floats], check: Check
+    true_map: TrueMap, orbit: Floats, control: Floats, noise: list[Floats], guard: Guard
 ) -> None:
-    images, partition = true_map.images(orbit, control, noise, check), true_map.partition
+    images, partition = true_map.images(orbit, control, noise, guard), true_map.partition
     with np.errstate(invalid="ignore"):
         miss = partition.deviation(images, np.roll(orbit, -1, axis=0))
     off = np.abs(miss / partition.width).max(axis=1)
@@ -77,13 +77,13 @@ def _jacobian(
     control: Floats,
     noise: list[Floats],
     unit: Floats,
-    check: Check,
+    guard: Guard,
 ) -> Floats:
     """Return the derivatives by states and controls, shape (q, d, d + p); NaN at a kink."""
     at, d = np.concatenate([orbit, control], axis=1), orbit.shape[1]
     jets = [Jet.variable(Interval.point(y), j, len(at.T)) for j, y in enumerate(at.T)]
     fixed = [Jet.constant(y, len(at.T)) for y in noise]
-    images = true_map.enclose(jets[:d], jets[d:], fixed, check)
+    images = true_map.enclose(jets[:d], jets[d:], fixed, guard)
     if images is None:
         return np.moveaxis(_differences(true_map, at, noise, unit), 2, 0)
     slopes = []

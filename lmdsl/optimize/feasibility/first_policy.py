@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Floats, Pairs, Stop, never
+from lmdsl.common.types import Floats, Pairs, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.optimize.feasibility import slowest_growth, spectral_radius
+from lmdsl.optimize.feasibility import least_radius, spectral_radius
 from lmdsl.optimize.feasibility.stopping import optimal_stopping
 from lmdsl.optimize.linear import equations
 from lmdsl.optimize.linear.gauss_seidel import TOLERANCE
@@ -44,7 +44,7 @@ class Refused:
     """
 
     w: Floats
-    best: spectral_radius.Growth
+    best: spectral_radius.PolicyClasses
     lower: float
 
 
@@ -59,7 +59,7 @@ class Undecided:
     lower: float
 
 
-def _proved(lp: StabilizationLP, policy: Pairs, w: Floats, stop: Stop) -> Floats | None:
+def _proved(lp: StabilizationLP, policy: Pairs, w: Floats, time_up: TimeUp) -> Floats | None:
     """Make of a guess a proof that a policy is g-stabilizing; None where it takes too long.
 
     Where its own value is soon known and every cost positive, it is the proof; else the guess is
@@ -86,7 +86,7 @@ def _proved(lp: StabilizationLP, policy: Pairs, w: Floats, stop: Stop) -> Floats
                 return proof
             if left > 0.3 * before or left <= TOLERANCE:
                 break
-            if stop():
+            if time_up():
                 raise Stopped
             before = left
         if left > TOLERANCE and equations.lift(rows, used_cost, proof) and proves(proof):
@@ -94,7 +94,7 @@ def _proved(lp: StabilizationLP, policy: Pairs, w: Floats, stop: Stop) -> Floats
     return even()
 
 
-def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused | Undecided:
+def stabilizing(lp: StabilizationLP, time_up: TimeUp = never) -> Feasible | Refused | Undecided:
     """Find a policy that is stabilizing with weight g = max(gamma, 1), or a proof against it.
 
     Candidates are the greedy policies of value iteration under unit cost from the levels of
@@ -105,7 +105,7 @@ def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused |
     """
     reached: Feasible | Refused | Undecided = Undecided(lp._algorithm_1[1], 0.0)
     try:
-        for reached in _raising(lp, stop):
+        for reached in _raising(lp, time_up):
             if not isinstance(reached, Undecided):
                 break
     except Stopped:
@@ -113,7 +113,7 @@ def stabilizing(lp: StabilizationLP, stop: Stop = never) -> Feasible | Refused |
     return reached
 
 
-def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | Undecided]:
+def _raising(lp: StabilizationLP, time_up: TimeUp) -> Iterator[Feasible | Refused | Undecided]:
     """Raise gamma step by step; yield what is known after each, the decision last."""
     g = lp.growth
     level, policy = lp._algorithm_1
@@ -121,7 +121,7 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
     for k in range(4 if level.max() <= NEAR else 0):
         better = bellman.rise(lp, V, g, k % 2 == 1)
         V = better.value
-        w = _proved(lp, better.policy, V, stop) if k in (0, 3) else None
+        w = _proved(lp, better.policy, V, time_up) if k in (0, 3) else None
         if w is not None:
             yield Feasible(better.policy, w)
             return
@@ -129,28 +129,28 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
     for horizon in (4.0 * level.max(), 64.0 * level.max()):
         at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
         for _ in range(4):
-            done = iterate(lp, policy, value, at, unit, stop=stop, limit=6)
+            done = iterate(lp, policy, value, at, unit, time_up=time_up, limit=6)
             policy, value = done.policy, done.value
-            w = _proved(lp, policy, value, stop)
+            w = _proved(lp, policy, value, time_up)
             yield Undecided(policy, at) if w is None else Feasible(policy, w)
-            if stop():
+            if time_up():
                 return
             if not asked:
-                asked, decided = True, _decided(lp, stop)
+                asked, decided = True, _decided(lp, time_up)
                 yield decided
                 if not isinstance(decided, Undecided):
                     return
             if done.converged:
                 break
     for _ in range(200):
-        done = iterate(lp, policy, value, at, unit, stop=stop)
+        done = iterate(lp, policy, value, at, unit, time_up=time_up)
         policy, value = done.policy, done.value
         yield Undecided(policy, at)
-        w, _ = stability_vector(lp, policy, stop=stop)
+        w, _ = stability_vector(lp, policy, time_up=time_up)
         if w is not None:
             yield Feasible(policy, w)
             return
-        if stop():
+        if time_up():
             return
         # Raise gamma as far towards g as this policy allows, by bisection from above (of exponents,
         # as long as g is out of sight).
@@ -158,30 +158,30 @@ def _raising(lp: StabilizationLP, stop: Stop) -> Iterator[Feasible | Refused | U
         while raised is None and reach > at * (1 + 1e-13):
             far = reach > 4 * at
             reach = math.sqrt(at) * math.sqrt(reach) if far else at + (reach - at) / 2
-            raised, _ = stability_vector(lp, policy, g=reach, stop=stop)
+            raised, _ = stability_vector(lp, policy, g=reach, time_up=time_up)
         if raised is None:
             return
         at, value = reach, raised
         yield Undecided(policy, at)
 
 
-def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
+def _decided(lp: StabilizationLP, time_up: TimeUp) -> Feasible | Refused | Undecided:
     """Decide a gamma > 1 by optimal stopping at gamma' just below gamma, or gamma itself.
 
     The greatest solution w of w = min(1, gamma' min_a P_a w) is 0 exactly when gamma' < gamma_bar.
     Then the last policy is stabilizing at gamma', and as a rule at gamma too. Else w is the proof
     against gamma; the slack absorbs rounding.
     """
-    best = slowest_growth.improved(lp, spectral_radius.short_lived(lp, stop), stop, lp.gamma)
+    best = least_radius.improved(lp, spectral_radius.short_lived(lp, time_up), time_up, lp.gamma)
     for slack in (1e-6, 1e-9, 1e-12, 0.0):
         if best.limit > lp.gamma:
-            w, _ = stability_vector(lp, best.policy, stop=stop)
+            w, _ = stability_vector(lp, best.policy, time_up=time_up)
             if w is not None:
                 return Feasible(best.policy, w)
         at = lp.gamma * (1 - slack)
         going = best.rate * at < 1 - 1e-12
         reward = np.where(going, 1.0, best.x)
-        found = optimal_stopping(lp, at, reward, best.policy, going, stop)
+        found = optimal_stopping(lp, at, reward, best.policy, going, time_up)
         if found is None:
             break
         if found.refuses:
@@ -190,6 +190,6 @@ def _decided(lp: StabilizationLP, stop: Stop) -> Feasible | Refused | Undecided:
             w = found.w if bounds.holds_for_all(lp, found.w, lp.gamma, None) else found.carried
             return Refused(w, best, low)
         if found.going.all():
-            better = spectral_radius.of_policy(lp, found.policy, stop)
+            better = spectral_radius.of_policy(lp, found.policy, time_up)
             best = better if better.limit > best.limit else best
     return Undecided(best.policy, 0.0)

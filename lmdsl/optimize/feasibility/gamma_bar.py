@@ -29,13 +29,13 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.frozen import Frozen
-from lmdsl.common.types import Floats, Pairs, Progress, Stop, never
+from lmdsl.common.types import Floats, Pairs, Progress, TimeUp, never
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, Stopped
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.lp import StabilizationLP, compile
-from lmdsl.optimize.feasibility import slowest_growth, spectral_radius
+from lmdsl.optimize.feasibility import least_radius, spectral_radius
 from lmdsl.optimize.feasibility.infeasible import (
     LEAST_WIDTH,
     WIDTH,
@@ -45,7 +45,7 @@ from lmdsl.optimize.feasibility.infeasible import (
     check_high,
     exhausted_by_levels,
 )
-from lmdsl.optimize.feasibility.spectral_radius import Growth
+from lmdsl.optimize.feasibility.spectral_radius import PolicyClasses
 from lmdsl.problem.problem import Problem
 
 FARTHER = (1e-5, 1e-3, 0.1, 1.0)
@@ -180,19 +180,19 @@ def gamma_max(
 
 def bracket(
     lp: StabilizationLP,
-    stop: Stop = never,
+    time_up: TimeUp = never,
     limit: int = 60,
     width: float = WIDTH,
-    start: Growth | None = None,
+    start: PolicyClasses | None = None,
 ) -> GammaBar:
-    """Enclose gamma_bar of a compiled model, from a policy; ``stop`` ends the work early."""
+    """Enclose gamma_bar of a compiled model, from a policy; ``time_up`` ends the work early."""
     if not lp.n:
         nobody = np.empty(0, dtype=np.int64)
         return GammaBar(0.0, 0.0, nobody, None, None, "no cell is stabilizable")
     certain = exhausted_by_levels(lp)
     if certain is not None:
         return GammaBar(math.inf, math.inf, certain, None, None, stabilizable=lp.n)
-    search = _Search(lp, stop, lp._algorithm_1[1], width)
+    search = _Search(lp, time_up, lp._algorithm_1[1], width)
     with suppress(Stopped):
         search.run(limit, start)
     return search.found()
@@ -207,7 +207,7 @@ def enclosed(lp: StabilizationLP, low: float, high: float) -> tuple[float, float
     proved = 0.0, math.inf
     for width in (WIDTH, LEAST_WIDTH):
         search = _Search(lp, never, lp._algorithm_1[1], width)
-        search.stop = partial(_inside, search, low, high)
+        search.time_up = partial(_inside, search, low, high)
         with suppress(Stopped):
             search.run(60)
         proved = max(proved[0], search.low), min(proved[1], search.high)
@@ -223,54 +223,54 @@ def _inside(search: _Search, low: float, high: float) -> bool:
 class _Search:
     """The bracket while it narrows: both ends, their vectors, and the best policy so far."""
 
-    def __init__(self, lp: StabilizationLP, stop: Stop, policy: Pairs, width: float) -> None:
-        self.lp, self.stop, self.policy, self.width = lp, stop, policy, width
+    def __init__(self, lp: StabilizationLP, time_up: TimeUp, policy: Pairs, width: float) -> None:
+        self.lp, self.time_up, self.policy, self.width = lp, time_up, policy, width
         self.steps = (0.1 * width, 0.4 * width, *(x for x in FARTHER if x > width))
         self.low, self.high = 0.0, math.inf
         self.w_low: Floats | None = None
         self.w_high: Floats | None = None
-        self.best: Growth | None = None
+        self.best: PolicyClasses | None = None
 
     @property
     def closed(self) -> bool:
         return self.high <= self.low * (1 + self.width)
 
-    def run(self, limit: int, start: Growth | None = None) -> None:
+    def run(self, limit: int, start: PolicyClasses | None = None) -> None:
         """Narrow the bracket until it closes, or doubles decide no more."""
-        best = start or spectral_radius.short_lived(self.lp, self.stop)
+        best = start or spectral_radius.short_lived(self.lp, self.time_up)
         for _ in range(limit):
-            best = slowest_growth.improved(self.lp, best, self.stop, least=0.01 * self.width)
+            best = least_radius.improved(self.lp, best, self.time_up, least=0.01 * self.width)
             self._raise_low(best)
-            if self.stop():
+            if self.time_up():
                 return
             better = self._closing(best)
             if self.closed:
                 return
             if better is None:
-                better = _climbed(self.lp, best, self.stop)
+                better = _climbed(self.lp, best, self.time_up)
                 if better is best:
                     return
             best = better
             # Halve the bracket too, so that many small gains cannot make it long.
             for _ in range(HALVINGS):
                 top = self.high if math.isfinite(self.high) else 4 * best.limit
-                if top <= best.limit * (1 + COARSE) or self.stop():
+                if top <= best.limit * (1 + COARSE) or self.time_up():
                     break
-                answer = _beyond(self.lp, best, math.sqrt(best.limit * top), self.stop)
-                if isinstance(answer, Growth):
+                answer = _beyond(self.lp, best, math.sqrt(best.limit * top), self.time_up)
+                if isinstance(answer, PolicyClasses):
                     best = answer
                 elif answer is not None:
                     self._take(*answer)
                 else:
                     break
 
-    def _closing(self, best: Growth) -> Growth | None:
+    def _closing(self, best: PolicyClasses) -> PolicyClasses | None:
         """Ask a little beyond the limit of a policy: take the high, or return a better policy."""
         self._take(check_high(self.lp, best.slow_vector), best.slow_vector)
         closed = self.closed
         for step in self.steps[:1] if closed else self.steps:
-            answer = _beyond(self.lp, best, best.limit * (1 + step), self.stop)
-            if isinstance(answer, Growth):
+            answer = _beyond(self.lp, best, best.limit * (1 + step), self.time_up)
+            if isinstance(answer, PolicyClasses):
                 return answer
             if answer is not None:
                 # Of two vectors that close it, that of optimal stopping names all cells.
@@ -278,7 +278,7 @@ class _Search:
                 break
         return None
 
-    def _raise_low(self, best: Growth) -> None:
+    def _raise_low(self, best: PolicyClasses) -> None:
         self.best = best
         proved = spectral_radius.prove_low(self.lp, best)
         if proved is not None and proved[0] > self.low:
@@ -294,11 +294,11 @@ class _Search:
         lp, high, note = self.lp, self.high, ""
         if not self.closed:
             note = "the vectors leave the range of doubles; the bracket is as tight as they allow"
-            note = "the work was ended before the bracket closed" if self.stop() else note
+            note = "the work was ended before the bracket closed" if self.time_up() else note
         beyond = limiting = None
         if self.w_high is not None and self.best is not None:
             most = max(high, self.low * (1 + self.width))
-            core, high = _core(lp, self.best, self.w_high, high, most, self.stop)
+            core, high = _core(lp, self.best, self.w_high, high, most, self.time_up)
             beyond, limiting = (Area.of(lp.partition, lp.cells[w > 0]) for w in (self.w_high, core))
         return GammaBar(
             self.low, high, self.policy, self.w_low, self.w_high, note, beyond, limiting, lp.n

@@ -7,13 +7,13 @@ from contextlib import suppress
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Bools, Floats, Pairs, Stop
+from lmdsl.common.types import Bools, Floats, Pairs, TimeUp
 from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize import descent
-from lmdsl.optimize.feasibility import slowest_growth, spectral_radius, stopping
-from lmdsl.optimize.feasibility.spectral_radius import Growth
+from lmdsl.optimize.feasibility import least_radius, spectral_radius, stopping
+from lmdsl.optimize.feasibility.spectral_radius import PolicyClasses
 from lmdsl.optimize.policies import evaluation, iteration
 
 WIDTH, LEAST_WIDTH = 1e-6, 1e-8
@@ -42,25 +42,29 @@ def exhausted_by_levels(lp: StabilizationLP) -> Pairs | None:
     return policy if (policy >= 0).all() else None
 
 
-def _climbed(lp: StabilizationLP, start: Growth, stop: Stop) -> Growth:
+def _climbed(lp: StabilizationLP, start: PolicyClasses, time_up: TimeUp) -> PolicyClasses:
     """Improve a policy under unit cost just below its limit, where its value fits into doubles."""
     unit = np.ones(lp.K)
     for below in (1e-3, 0.1):
         at = start.limit * (1 - below)
-        value = evaluation.evaluate(lp, start.policy, at, unit, stop=stop)
+        value = evaluation.evaluate(lp, start.policy, at, unit, time_up=time_up)
         if value is None:
             continue
-        done = iteration.iterate(lp, start.policy, value, at, unit, stop=stop)
+        done = iteration.iterate(lp, start.policy, value, at, unit, time_up=time_up)
         if not done.steps:
             return start
-        found = spectral_radius.of_policy(lp, done.policy, stop)
+        found = spectral_radius.of_policy(lp, done.policy, time_up)
         return found if found.limit > start.limit else start
     return start
 
 
 def _beyond(
-    lp: StabilizationLP, start: Growth, gamma: float, stop: Stop, inside: Bools | None = None
-) -> Growth | tuple[float, Floats] | None:
+    lp: StabilizationLP,
+    start: PolicyClasses,
+    gamma: float,
+    time_up: TimeUp,
+    inside: Bools | None = None,
+) -> PolicyClasses | tuple[float, Floats] | None:
     """Decide a gamma: a policy that is stabilizing there, or a proved high and its vector.
 
     Neither where doubles do not decide. The first stopping policy goes on wherever the class of
@@ -71,11 +75,11 @@ def _beyond(
     if inside is not None:
         reward, going = np.where(inside, reward, 0.0), going & inside
     limit = 1000 if inside is None else DODGES
-    found = stopping.optimal_stopping(lp, gamma, reward, start.policy, going, stop, limit)
+    found = stopping.optimal_stopping(lp, gamma, reward, start.policy, going, time_up, limit)
     if found is None:
         return None
     if not found.refuses:
-        better = spectral_radius.of_policy(lp, found.policy, stop) if found.going.all() else None
+        better = spectral_radius.of_policy(lp, found.policy, time_up) if found.going.all() else None
         return better if better is not None and better.limit > start.limit else None
     # Small entries may be rounding, or what carries a vector that falls over many decades.
     for w in (found.carried, found.w):
@@ -87,11 +91,11 @@ def _beyond(
 
 def _core(
     lp: StabilizationLP,
-    best: Growth,
+    best: PolicyClasses,
     w_high: Floats,
     high: float,
     most: float,
-    stop: Stop,
+    time_up: TimeUp,
 ) -> tuple[Floats, float]:
     """Return an upper vector on the slowest classes alone, and a high that holds for it too.
 
@@ -103,12 +107,12 @@ def _core(
     if needed is not None and needed <= most:
         return best.slow_vector, max(high, needed)
     # How far the controls can dodge these classes: they limit nothing if far enough.
-    alone = slowest_growth.improved(lp, best, stop, most, inside=best.slowest)
+    alone = least_radius.improved(lp, best, time_up, most, inside=best.slowest)
     if alone.limit > most:
         return w_high, high
     answer = None
     with suppress(Stopped):
-        answer = _beyond(lp, alone, alone.limit * (1 + 0.1 * WIDTH), stop, best.slowest)
+        answer = _beyond(lp, alone, alone.limit * (1 + 0.1 * WIDTH), time_up, best.slowest)
     if isinstance(answer, tuple) and answer[0] <= most:
         return answer[1], max(high, answer[0])
     return w_high, high

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Stop
+from lmdsl.common.types import Floats, TimeUp
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.directions import Directions
 from lmdsl.optimize.linear import classes, equations
-from lmdsl.optimize.linear.gauss_seidel import System
+from lmdsl.optimize.linear.gauss_seidel import SplitMatrix
 
 LEAST_ENTRY = 1e-250
 """Least entry of the vector of a class whose largest is 1."""
@@ -31,7 +31,7 @@ SMALLEST, LARGEST = 1e-280, 1e300
 
 def _perron(
     inner: Any,
-    stop: Stop,
+    time_up: TimeUp,
     slowest: float = 0.0,
     directions: Directions | None = None,
     start: Floats | None = None,
@@ -65,7 +65,7 @@ def _perron(
         # A little off top, so that the last steps are not singular.
         middle = max((top + bottom) / 2, top * (1 - reach))
         at = middle if halve else top * (1 + 1e-9)
-        y = _solved(M / at, x, stop, directions)
+        y = _solved(M / at, x, time_up, directions)
         if y is None:
             if not halve:
                 break
@@ -86,7 +86,7 @@ def _perron(
     return x, top, least
 
 
-def _solved(M: Any, x: Floats, stop: Stop, directions: Directions | None) -> Floats | None:
+def _solved(M: Any, x: Floats, time_up: TimeUp, directions: Directions | None) -> Floats | None:
     """Return y = x + M y, largest entry 1, None where it is not positive or leaves doubles."""
     if isinstance(M, np.ndarray):
         try:
@@ -94,12 +94,12 @@ def _solved(M: Any, x: Floats, stop: Stop, directions: Directions | None) -> Flo
         except np.linalg.LinAlgError:
             return None
     elif directions is None:
-        y = equations.solve(M, x, stop=stop)
+        y = equations.solve(M, x, time_up=time_up)
     else:
         scaled = M.copy()  # all sizes alike, as a Krylov method wants them
         scaled.data *= x[M.indices] / np.repeat(x, np.diff(M.indptr))
         y = equations.guess(
-            replace(System.of(scaled), directions=directions), np.ones(len(x)), stop
+            replace(SplitMatrix.of(scaled), directions=directions), np.ones(len(x)), time_up
         )
         y = None if y is None else x * y
     if y is None or not np.isfinite(y).all() or not y.min() > 0:

@@ -1,4 +1,4 @@
-"""The growth of one policy, class by class: an upper bound of rho(P_u) that anyone can check.
+"""The spectral radius of one policy by class: an upper bound of rho(P_u) that anyone can check.
 
 rho(P_u) is the largest spectral radius of a strongly connected class. Each class gets a positive
 vector close to its Perron vector by Noda's iteration; w is these vectors, each scaled so that what
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Bools, Floats, Pairs, Stop, never
+from lmdsl.common.types import Bools, Floats, Pairs, TimeUp, never
 from lmdsl.machine.forking import cached_property
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility.perron import FINE, _perron, _scale
@@ -42,7 +42,7 @@ ROUNDS, COARSE, SLIGHT = 100, 1e-2, 1e-10
 
 
 @dataclass(frozen=True, eq=False)
-class Growth:
+class PolicyClasses:
     """A policy class by class.
 
     Attributes
@@ -90,16 +90,16 @@ class Growth:
 def of_policy(
     lp: StabilizationLP,
     policy: Pairs,
-    stop: Stop = never,
+    time_up: TimeUp = never,
     start: Floats | None = None,
     enough: float = FINE,
     inside: Bools | None = None,
-) -> Growth:
+) -> PolicyClasses:
     """Take a policy apart into classes and estimate the spectral radius of each.
 
     Parameters
     ----------
-    lp, policy, stop
+    lp, policy, time_up
         The model, a column per cell, and what ends the work.
     start, enough
         A guess of x, and how well the rates have to be known, relative.
@@ -120,13 +120,13 @@ def of_policy(
         directions = lp._directions.among(cells) if len(cells) >= equations.KRYLOV else None
         begin = None if start is None else start[cells]
         x[cells], rate[cells], least = _perron(
-            P[cells][:, cells], stop, slowest, directions, begin, enough
+            P[cells][:, cells], time_up, slowest, directions, begin, enough
         )
         slowest = max(slowest, least)
-    return Growth(policy, P, order, ends, x, rate, enough)
+    return PolicyClasses(policy, P, order, ends, x, rate, enough)
 
 
-def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
+def short_lived(lp: StabilizationLP, time_up: TimeUp = never) -> PolicyClasses:
     """Return a policy that brings runs home within a few steps, as far as any is known to do.
 
     From the levels of Algorithm 1, w <- min_a P_a w weighs what has not arrived by then. Where runs
@@ -143,30 +143,30 @@ def short_lived(lp: StabilizationLP, stop: Stop = never) -> Growth:
             w = done.value
         yield done.policy, None
         unit, value = np.ones(lp.K), np.full(lp.n, horizon)
-        found = iteration.iterate(lp, policy, value, 1 - 1 / horizon, unit, stop=stop)
+        found = iteration.iterate(lp, policy, value, 1 - 1 / horizon, unit, time_up=time_up)
         yield found.policy, found.value
         yield policy, None
 
-    best: Growth | None = None
+    best: PolicyClasses | None = None
     for candidate, start in candidates():
-        one = of_policy(lp, candidate, stop, start, COARSE)
+        one = of_policy(lp, candidate, time_up, start, COARSE)
         if one.limit <= 1 + 1 / horizon:
-            one = of_policy(lp, candidate, stop, one.x, 0.1 / horizon)
+            one = of_policy(lp, candidate, time_up, one.x, 0.1 / horizon)
         best = one if best is None or one.limit > best.limit else best
-        if stop() or best.limit > 1 + 1 / horizon:
+        if time_up() or best.limit > 1 + 1 / horizon:
             break
     assert best is not None
     return best
 
 
-def prove_low(lp: StabilizationLP, found: Growth) -> tuple[float, Floats] | None:
+def prove_low(lp: StabilizationLP, found: PolicyClasses) -> tuple[float, Floats] | None:
     """Return a proved low of a policy and its w."""
     w = lifted(found)
     low = None if w is None else check_low(lp, found.policy, w)
     return None if w is None or low is None else (low, w)
 
 
-def lifted(found: Growth) -> Floats | None:
+def lifted(found: PolicyClasses) -> Floats | None:
     """Return w > 0 with P_u w <= lam w, with the least slack that doubles allow."""
     P, w, rho = found.P, np.empty(len(found.x)), float(found.rate.max())
 

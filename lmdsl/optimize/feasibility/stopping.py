@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmdsl.common.types import Bools, Floats, Pairs, Stop, never
+from lmdsl.common.types import Bools, Floats, Pairs, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.linear import equations
@@ -54,7 +54,7 @@ def optimal_stopping(
     reward: Floats,
     policy: Pairs | None = None,
     going: Bools | None = None,
-    stop: Stop = never,
+    time_up: TimeUp = never,
     limit: int = 1000,
 ) -> Stopping | None:
     """Stop in a cell for ``reward``, or go on under the least favourable control, for ever.
@@ -71,13 +71,13 @@ def optimal_stopping(
         Shape (n,), >= 0.
     policy, going
         A first policy, transient under gamma P on the cells that go; default: stop everywhere.
-    stop, limit
+    time_up, limit
         End the work, with None; largest number of steps.
     """
     policy = lp.pair_pointer[:-1].copy() if policy is None else policy
     going = np.zeros(lp.n, dtype=np.bool_) if going is None else going
     try:
-        return _stopping(lp, gamma, reward, policy, going, stop, limit)
+        return _stopping(lp, gamma, reward, policy, going, time_up, limit)
     except Stopped:
         return None
 
@@ -88,16 +88,16 @@ def _stopping(
     reward: Floats,
     policy: Pairs,
     going: Bools,
-    stop: Stop,
+    time_up: TimeUp,
     limit: int,
 ) -> Stopping:
     zero = np.zeros(lp.K)
-    w = _stopped(lp, gamma, reward, policy, going, reward, stop)
+    w = _stopped(lp, gamma, reward, policy, going, reward, time_up)
     if w is None:
         going = np.zeros(lp.n, dtype=np.bool_)
         w = reward
     for step in range(limit):
-        if stop():
+        if time_up():
             raise Stopped
         lowered, new_pair, new_going = w, policy, going
         for _ in range(step + 1):
@@ -112,7 +112,7 @@ def _stopping(
             new_going = np.where(change, better.value <= reward, new_going)
         if lowered is w:
             return Stopping(np.minimum(w, reward), policy, going, True)
-        new = _stopped(lp, gamma, reward, new_pair, new_going, w, stop)
+        new = _stopped(lp, gamma, reward, new_pair, new_going, w, time_up)
         if new is None or not (new < w).any():
             break  # rounding made a change look better than it is
         w, policy, going = new, new_pair, new_going
@@ -126,7 +126,7 @@ def _stopped(
     policy: Pairs,
     going: Bools,
     before: Floats,
-    stop: Stop,
+    time_up: TimeUp,
 ) -> Floats | None:
     """Return what a stopping policy is paid: w = gamma P w where it goes, the reward elsewhere.
 
@@ -137,7 +137,7 @@ def _stopped(
         unit = np.maximum(before, LEAST_UNIT)
         P = gamma * lp.rows.matrix(policy[going])
         P.data *= unit[P.indices] / np.repeat(unit[going], np.diff(P.indptr))
-        new = equations.solve(P[:, going], P[:, ~going] @ (reward / unit)[~going], stop=stop)
+        new = equations.solve(P[:, going], P[:, ~going] @ (reward / unit)[~going], time_up=time_up)
         if new is None:
             return None
         w[going] = unit[going] * new

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, Stop, never
+from lmdsl.common.types import Floats, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.kernels import kernel
 from lmdsl.optimize.linear.gauss_seidel import CEILING
@@ -23,7 +23,7 @@ _filtering = threading.Lock()
 """Filters of warnings belong to the process: one thread at a time changes and restores them."""
 
 
-def solve_by_class(M: Any, b: Floats, stop: Stop = never) -> tuple[Floats | None, bool]:
+def solve_by_class(M: Any, b: Floats, time_up: TimeUp = never) -> tuple[Floats | None, bool]:
     """Solve class by class; return x or None, and whether every class was small enough to try."""
     order, ends = classes(M)
     lengths = np.diff(ends, prepend=0)
@@ -38,7 +38,7 @@ def solve_by_class(M: Any, b: Floats, stop: Stop = never) -> tuple[Floats | None
             return None, True
         if k == count:
             break
-        if stop():
+        if time_up():
             raise Stopped
         cells = order[until : ends[k]]
         if not _solve_class(M, b, x, cells):

@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, Stop, never
+from lmdsl.common.types import Floats, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.optimize.linear import extrapolation
 from lmdsl.optimize.linear.classes import _spread, solve_by_class
-from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, TOLERANCE, System
+from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, TOLERANCE, SplitMatrix
 from lmdsl.optimize.linear.krylov import _bicgstab
 from lmdsl.optimize.linear.substitution import Peeled
 
@@ -43,7 +43,7 @@ def solve(
     start: Floats | None = None,
     enough: float = TOLERANCE,
     flat: float = 0.0,
-    stop: Stop = never,
+    time_up: TimeUp = never,
 ) -> Floats | None:
     """Return x >= 0 with x = b + M x, or None where there is none (as far as rounding can tell).
 
@@ -57,17 +57,17 @@ def solve(
         A guess, shape (n,), >= 0.
     enough, flat
         Relative, and absolute, change of a sweep that ends the work.
-    stop
+    time_up
         Asked after the first few sweeps, then again and again between sweeps and classes.
 
     Raises
     ------
     Stopped
-        ``stop`` said so.
+        ``time_up`` said so.
     """
     x = np.array(b if start is None else start, dtype=np.float64)
-    peeled = Peeled.of(System.of(M))
-    return x if solve_from(peeled, b, x, lambda: M, enough, flat, stop) else None
+    peeled = Peeled.of(SplitMatrix.of(M))
+    return x if solve_from(peeled, b, x, lambda: M, enough, flat, time_up) else None
 
 
 def solve_from(
@@ -77,7 +77,7 @@ def solve_from(
     matrix: Callable[[], Any],
     enough: float = TOLERANCE,
     flat: float = 0.0,
-    stop: Stop = never,
+    time_up: TimeUp = never,
 ) -> bool:
     """Solve in place from a guess; ``matrix`` makes M, as a CSR array, where sweeps are slow."""
     core, inner = peeled.core, peeled.inner
@@ -87,7 +87,7 @@ def solve_from(
         return matrix() if whole else matrix()[core][:, core]
 
     guess, c = (x, b) if whole else (x[core], b[core])
-    y = _solve(inner, c, guess, part, enough, flat, stop)
+    y = _solve(inner, c, guess, part, enough, flat, time_up)
     if y is None:
         return False
     x[core] = y
@@ -101,7 +101,7 @@ def solve_transposed(
     start: Floats | None = None,
     enough: float = TOLERANCE,
     flat: float = 0.0,
-    stop: Stop = never,
+    time_up: TimeUp = never,
 ) -> Floats | None:
     """Return x >= 0 with x = b + M'x, or None; parameters as in :func:`solve_from`."""
     x, core = b.copy(), peeled.core
@@ -113,7 +113,7 @@ def solve_transposed(
         return matrix()[core][:, core].T.tocsr()
 
     c = x[core]
-    y = _solve(inner, c, c.copy() if start is None else start[core], part, enough, flat, stop)
+    y = _solve(inner, c, c.copy() if start is None else start[core], part, enough, flat, time_up)
     if y is None:
         return None
     x[core] = y
@@ -147,7 +147,7 @@ def advance(peeled: Peeled, b: Floats, x: Floats, count: int, enough: float, fla
     return change if peeled.substitute(b, x) else np.inf
 
 
-def descend(peeled: Peeled, b: Floats, x: Floats, enough: float, stop: Stop = never) -> bool:
+def descend(peeled: Peeled, b: Floats, x: Floats, enough: float, time_up: TimeUp = never) -> bool:
     """Lower x >= b + M x in place, b > 0, by a Krylov method; False where that fails.
 
     Its y is close to the solution, not above b + M y. With r = b + M y - y and t >= max(r / b),
@@ -157,7 +157,7 @@ def descend(peeled: Peeled, b: Floats, x: Floats, enough: float, stop: Stop = ne
     system, c = (peeled.system, b) if whole else (peeled.inner, b[peeled.core])
     v = x if whole else x[peeled.core]
     if len(v):
-        y = _krylov(system, c, v, stop, max(enough, 1e-13))
+        y = _krylov(system, c, v, time_up, max(enough, 1e-13))
         if y is None:
             return False
         system.sweep(c, y, len(system.directions.cycle))
@@ -186,13 +186,13 @@ def lift(peeled: Peeled, b: Floats, x: Floats) -> bool:
 
 
 def _solve(
-    system: System,
+    system: SplitMatrix,
     b: Floats,
     x: Floats,
     matrix: Callable[[], Any],
     enough: float,
     flat: float,
-    stop: Stop,
+    time_up: TimeUp,
 ) -> Floats | None:
     """Solve from a guess, which is overwritten, by sweeps or class by class."""
     nothing = ~_pays(system, b) if (b == 0).any() else None
@@ -203,7 +203,7 @@ def _solve(
         return x
     guess = None
     if len(b) >= KRYLOV and not _soon(change, rate, FEW_SWEEPS):
-        guess = _krylov(system, b, x, stop)
+        guess = _krylov(system, b, x, time_up)
     if guess is not None:
         x = guess
         if nothing is not None:
@@ -212,11 +212,11 @@ def _solve(
         if change <= enough:
             return x
     if not _soon(change, rate, MANY_SWEEPS):
-        direct, small_enough = solve_by_class(matrix(), b, stop)
+        direct, small_enough = solve_by_class(matrix(), b, time_up)
         if direct is not None or small_enough:
             return direct
     for _ in range(MAX_SWEEPS // TRIAL_SWEEPS):
-        if stop():
+        if time_up():
             raise Stopped
         change, rate = _trial(system, b, x, enough, flat)
         if change <= enough:
@@ -226,16 +226,16 @@ def _solve(
     return None
 
 
-def guess(system: System, b: Floats, stop: Stop = never) -> Floats | None:
+def guess(system: SplitMatrix, b: Floats, time_up: TimeUp = never) -> Floats | None:
     """Return x close to b + M x by a Krylov method and sweeps alone; None where it breaks down."""
-    x = _krylov(system, b, b.copy(), stop)
+    x = _krylov(system, b, b.copy(), time_up)
     if x is not None:
         system.sweep(b, x, TRIAL_SWEEPS // 3)
     return x
 
 
 def _krylov(
-    system: System, b: Floats, x: Floats, stop: Stop, enough: float = 1e-13
+    system: SplitMatrix, b: Floats, x: Floats, time_up: TimeUp, enough: float = 1e-13
 ) -> Floats | None:
     """Return a better guess by BiCGSTAB (van der Vorst 1992), None where it breaks down.
 
@@ -259,14 +259,14 @@ def _krylov(
         if not 0 < unit < CEILING:
             return None
         known, steps = swept(b / unit, zero), min(KRYLOV_STEPS, KRYLOV_SWEEPS // (2 * count))
-        y = _bicgstab(lambda v: v - swept(zero, v), known, x / unit, steps, stop, enough)
+        y = _bicgstab(lambda v: v - swept(zero, v), known, x / unit, steps, time_up, enough)
         guess = np.maximum(unit * y, b)
     if not (guess < CEILING).all() or y.min() < -1e-9 * y.max():
         return None
     return guess
 
 
-def _pays(system: System, b: Floats) -> NDArray[np.bool_]:
+def _pays(system: SplitMatrix, b: Floats) -> NDArray[np.bool_]:
     """Return where x > 0: the cells from which some b > 0 can be reached."""
     pays, before = b > 0, system.transposed()
     _spread(before.begin, before.end, before.indices, pays)
@@ -280,7 +280,9 @@ def _soon(change: float, rate: float, sweeps: int) -> bool:
     return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < sweeps)
 
 
-def _trial(system: System, b: Floats, x: Floats, enough: float, flat: float) -> tuple[float, float]:
+def _trial(
+    system: SplitMatrix, b: Floats, x: Floats, enough: float, flat: float
+) -> tuple[float, float]:
     """Sweep; return the last relative change, and the factor by which a sweep shrinks it."""
     halfway, last = system.sweep(b, x, TRIAL_SWEEPS, enough, flat)
     rate = (last / halfway) ** (2 / TRIAL_SWEEPS) if 0 < halfway < np.inf else 0.0

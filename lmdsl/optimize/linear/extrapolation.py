@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from lmdsl.common.types import Floats
-from lmdsl.optimize.linear.gauss_seidel import CEILING, System
+from lmdsl.optimize.linear.gauss_seidel import CEILING, SplitMatrix
 
 SWEEPS, STEPS = 4, 16
 LEAST_FALL, FARTHEST = 1e-10, 1e4
@@ -17,7 +17,7 @@ LEAST_FALL, FARTHEST = 1e-10, 1e4
 ROUNDING = 1e-13
 
 
-def extrapolate(system: System, b: Floats, x: Floats) -> float:
+def extrapolate(system: SplitMatrix, b: Floats, x: Floats) -> float:
     """Lower x >= b + M x in place, mostly along the mode in which sweeps stall; return how far.
 
     A few sweeps, then Jacobi steps, which take r = x - (b + M x) from x and turn it into M r: soon
@@ -42,7 +42,7 @@ def extrapolate(system: System, b: Floats, x: Floats) -> float:
     return t
 
 
-def lift(system: System, b: Floats, x: Floats) -> bool:
+def lift(system: SplitMatrix, b: Floats, x: Floats) -> bool:
     """Raise x in place to x >= b + M x, mostly along the slowest mode; False where that fails.
 
     Jacobi steps x <- x + r, r <- M r begin with r >= b + M x - x, which stays true and brings r
@@ -63,6 +63,6 @@ def lift(system: System, b: Floats, x: Floats) -> bool:
     return bool((x < CEILING).all())
 
 
-def _moved(system: System, v: Floats) -> Floats:
+def _moved(system: SplitMatrix, v: Floats) -> Floats:
     """Return D^-1 (M - own) v with D = 1 - own, own the diagonal of M: one Jacobi step."""
     return system.inverse * system.times(v)

@@ -23,7 +23,7 @@ SPLIT = 100_000
 
 
 @dataclass(frozen=True, eq=False)
-class System:
+class SplitMatrix:
     """A matrix M with its diagonal apart.
 
     Attributes
@@ -44,7 +44,7 @@ class System:
     directions: Directions
 
     @classmethod
-    def of(cls, M: Any) -> System:
+    def of(cls, M: Any) -> SplitMatrix:
         """Split a CSR array."""
         n, entries = M.shape[0], len(M.data)
         end = np.empty(n, dtype=np.uint64)
@@ -54,7 +54,7 @@ class System:
         _split(M.indptr, M.indices, M.data, end, indices, data, inverse)
         return cls(begin, end, indices, data, inverse, Directions.line(n))
 
-    def transposed(self) -> System:
+    def transposed(self) -> SplitMatrix:
         """Return the transposed matrix."""
         count = np.zeros(len(self.begin) + 1, dtype=np.uint64)
         _count(self.begin, self.end, self.indices, count)
@@ -63,7 +63,7 @@ class System:
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
         end = start[:-1].copy()
         _turn(self.begin, self.end, self.indices, self.data, end, indices, data)
-        return System(start[:-1], end, indices, data, self.inverse, self.directions.reversed())
+        return SplitMatrix(start[:-1], end, indices, data, self.inverse, self.directions.reversed())
 
     def residual(self, b: Floats, x: Floats) -> Floats:
         """Return (b + M x - x) / (1 - own), own the diagonal of M."""
@@ -197,7 +197,7 @@ def _sweep(  # type: ignore[no-untyped-def]
 
 
 def _in_halves(
-    system: System, b: Floats, x: Floats, count: int, enough: float, flat: float
+    system: SplitMatrix, b: Floats, x: Floats, count: int, enough: float, flat: float
 ) -> tuple[float, float]:
     """Make the same sweeps in two halves at a time, each with the other's last values."""
     n = len(x)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Stop
+from lmdsl.common.types import Floats, TimeUp
 from lmdsl.machine.deadline import Stopped
 
 
@@ -16,7 +16,7 @@ def _bicgstab(
     b: Floats,
     x: Floats,
     steps: int,
-    stop: Stop,
+    time_up: TimeUp,
     enough: float,
 ) -> Floats:
     """Solve applied(x) = b to a relative residual ``enough``, or make so many steps."""
@@ -31,7 +31,7 @@ def _bicgstab(
     for _ in range(steps):
         if not dot(r, r) > least or rho == 0.0:
             break
-        if stop():
+        if time_up():
             raise Stopped
         q = applied(p)
         alpha = rho / dot(shadow, q)

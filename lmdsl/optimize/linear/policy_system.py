@@ -13,7 +13,7 @@ from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.rows import Rows, spans
-from lmdsl.optimize.linear.gauss_seidel import NEVER, System
+from lmdsl.optimize.linear.gauss_seidel import NEVER, SplitMatrix
 
 
 class Slots:
@@ -38,7 +38,7 @@ class Slots:
         ends = np.cumsum(capacity)
         count, entries = len(capacity), int(ends[-1]) if len(capacity) else 0
         self.chosen = np.full(count, rows.count, dtype=np.uint64)  # none
-        self.current = System(
+        self.current = SplitMatrix(
             (ends - capacity).view(np.uint64),
             np.empty(count, dtype=np.uint64),
             np.empty(entries, dtype=np.uint32),
@@ -60,7 +60,7 @@ class Slots:
         threads.each(longest, spans(len(capacity)))
         return cls(rows, capacity, gamma, directions)
 
-    def system(self, chosen: NDArray[np.int64]) -> System:
+    def system(self, chosen: NDArray[np.int64]) -> SplitMatrix:
         """Return gamma P for one row of each cell; it holds until the next call."""
         now = chosen.view(np.uint64)
 
@@ -123,7 +123,7 @@ def copy_row(  # type: ignore[no-untyped-def]
     end[r] = used
 
 
-def of_policy(lp: StabilizationLP, policy: Pairs, gamma: float) -> System:
+def of_policy(lp: StabilizationLP, policy: Pairs, gamma: float) -> SplitMatrix:
     """Return gamma P_u for a policy, ready for sweeps."""
     rows = lp.rows
     capacity = rows.pointer[policy + 1] - rows.pointer[policy]

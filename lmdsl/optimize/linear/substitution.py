@@ -21,9 +21,9 @@ from lmdsl.common.types import Floats
 from lmdsl.machine import threads
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.kernels import ONE, kernel
-from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, System
+from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, SplitMatrix
 
-Cells = NDArray[np.uint32]
+CellNumbers = NDArray[np.uint32]
 
 MANY, PARTS = 40_000, 8
 """Cells of a level that are worth several threads, and into how many ranges they are split."""
@@ -52,14 +52,14 @@ class Peeled:
         The system on the core, its cells numbered as in ``core``.
     """
 
-    system: System
-    order: Cells
+    system: SplitMatrix
+    order: CellNumbers
     levels: NDArray[np.int64]
-    core: Cells
-    inner: System
+    core: CellNumbers
+    inner: SplitMatrix
 
     @classmethod
-    def of(cls, system: System) -> Peeled:
+    def of(cls, system: SplitMatrix) -> Peeled:
         """Find the core of a system."""
         n = len(system.begin)
         order = np.empty(n + int(BYTE), dtype=np.uint32)
@@ -78,7 +78,7 @@ class Peeled:
         entries = int(length.sum())
         indices, data = np.empty(entries, dtype=np.uint32), np.empty(entries)
         _take(core, system.begin, system.end, system.indices, system.data, number, indices, data)
-        inner = System(
+        inner = SplitMatrix(
             begin, begin + length, indices, data, system.inverse[core],
             system.directions.among(core),
         )  # fmt: skip

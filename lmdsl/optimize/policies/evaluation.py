@@ -6,7 +6,7 @@ import numpy as np
 
 from lmdsl.certificate import bounds
 from lmdsl.common.types import Floats, Pairs, never
-from lmdsl.common.types import Stop as Stop
+from lmdsl.common.types import TimeUp as TimeUp
 from lmdsl.model.algorithm_1 import reaches_attractor
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.linear import equations
@@ -21,7 +21,7 @@ def evaluate(
     cost: Floats | None = None,
     start: Floats | None = None,
     transient: bool = False,
-    stop: Stop = never,
+    time_up: TimeUp = never,
     rows: Peeled | None = None,
 ) -> Floats | None:
     """Return V = G_u + gamma P_u V, shape (n,); None where the policy has no finite value.
@@ -36,7 +36,7 @@ def evaluate(
         A guess of V.
     transient
         The policy is known to be gamma-stabilizing, which saves looking whether it reaches A.
-    stop
+    time_up
         Ends the work, with :class:`lmdsl.machine.deadline.Stopped`.
     rows
         gamma P_u, where it is at hand.
@@ -47,7 +47,9 @@ def evaluate(
         return None
     x = np.array(b if start is None else start, dtype=np.float64)
     rows = peeled(lp, policy, gamma) if rows is None else rows
-    found = equations.solve_from(rows, b, x, lambda: gamma * lp.rows.matrix(policy), stop=stop)
+    found = equations.solve_from(
+        rows, b, x, lambda: gamma * lp.rows.matrix(policy), time_up=time_up
+    )
     return x if found else None
 
 
@@ -62,7 +64,7 @@ def stability_vector(
     guess: Floats | None = None,
     g: float | None = None,
     sharp: bool = False,
-    stop: Stop = never,
+    time_up: TimeUp = never,
     rows: Peeled | None = None,
 ) -> tuple[Floats, Floats] | tuple[None, None]:
     """Return w > 0, d > 0 with w >= g P_u w + d: a proof that the policy is g-stabilizing.
@@ -83,7 +85,7 @@ def stability_vector(
             return w, d
     units = np.broadcast_to(1.0, lp.K)  # takes no memory
     for inflation in (0.0, 5e-7, 1e-10):
-        w_more = evaluate(lp, policy, g * (1 + inflation), units, guess, stop=stop)
+        w_more = evaluate(lp, policy, g * (1 + inflation), units, guess, time_up=time_up)
         if w_more is not None and (d := bounds.decrease(lp, policy, w_more, g)) is not None:
             return w_more, d
     return None, None

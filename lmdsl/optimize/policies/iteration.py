@@ -17,7 +17,7 @@ import numpy as np
 
 from lmdsl.certificate import bounds
 from lmdsl.common.types import Floats, Pairs, never
-from lmdsl.common.types import Stop as Stop
+from lmdsl.common.types import TimeUp as TimeUp
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.linear import equations, extrapolation
@@ -72,7 +72,7 @@ def iterate(
     value: Floats,
     gamma: float | None = None,
     cost: Floats | None = None,
-    stop: Stop = never,
+    time_up: TimeUp = never,
     limit: int | None = None,
 ) -> Iteration:
     """Policy iteration from a gamma-stabilizing policy until no control is better.
@@ -85,7 +85,7 @@ def iterate(
         Its value, or any V >= T_u V, such as :func:`bound` gives.
     gamma, cost
         Other than the LP's own; ``cost`` has shape (K,).
-    stop, limit
+    time_up, limit
         Asked before every step; largest number of steps.
 
     Notes
@@ -106,7 +106,7 @@ def iterate(
     swept = 0  # sweeps that did not reach the end
     stalls = True  # sweeps do, in a single mode, as far as was seen
     while True:
-        out = stop() or step == limit
+        out = time_up() or step == limit
         done = screen.improve(V, policy, TIE) if not out else Pass(V, policy, 0, 0)
         exact = None
         if done.changed:
@@ -128,7 +128,7 @@ def iterate(
                 slow = swept > PATIENCE and positive
                 if slow:
                     enough = 0.1 * (fall or _fall(V, x))
-                    slow = equations.descend(rows, screen.policy_cost, x, enough, stop)
+                    slow = equations.descend(rows, screen.policy_cost, x, enough, time_up)
                     swept = swept if slow else 0
                 if far < sweeps and not slow:
                     left = equations.advance(rows, screen.policy_cost, x, sweeps, 0.1 * fall, 0.0)
@@ -143,9 +143,9 @@ def iterate(
         else:
             try:
                 rows = rows or Peeled.of(screen.slots.system(policy))
-                exact = evaluate(lp, policy, gamma, cost, done.value, True, stop, rows)
+                exact = evaluate(lp, policy, gamma, cost, done.value, True, time_up, rows)
                 if exact is None:
-                    exact = evaluate(lp, policy, gamma, cost, stop=stop)
+                    exact = evaluate(lp, policy, gamma, cost, time_up=time_up)
             except Stopped:
                 return Iteration(*(last or (policy, V)), step, False, screen)
             if exact is None:

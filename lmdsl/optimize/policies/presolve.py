@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Pairs, Stop, never
+from lmdsl.common.types import Floats, Pairs, TimeUp, never
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.policies import bellman, iteration
 
@@ -20,7 +20,7 @@ MARGIN = 1e-9
 
 
 def survivors(
-    lp: StabilizationLP, policy: Pairs, w: Floats | None = None, stop: Stop = never
+    lp: StabilizationLP, policy: Pairs, w: Floats | None = None, time_up: TimeUp = never
 ) -> Pairs:
     """Return the columns that may belong to an optimal policy, and those of a first one, ascending.
 
@@ -30,19 +30,19 @@ def survivors(
         The linear program.
     policy, w
         A gamma-stabilizing policy, a column per cell, and a proof of it where known.
-    stop
+    time_up
         Asked between passes; ends the work with what is known.
     """
     start = iteration.bound(lp, policy, w)
     if start is None:
         return np.arange(lp.K)
-    done = iteration.iterate(lp, policy, start, stop=stop, limit=STEPS)
+    done = iteration.iterate(lp, policy, start, time_up=time_up, limit=STEPS)
     lower = np.zeros(lp.n)
     for _ in range(PASSES):
         higher = np.maximum(lower, bellman.improve(lp, lower).value)
         risen = float(higher.sum() - lower.sum())
         lower = higher
-        if stop() or risen <= LEAST_RISE * float(lower.sum()):
+        if time_up() or risen <= LEAST_RISE * float(lower.sum()):
             break
     kept = bellman.below(lp, lower, done.value * (1 + MARGIN))
     kept[done.policy] = kept[policy] = True  # the first policy leads to A from everywhere

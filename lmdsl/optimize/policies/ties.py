@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lmdsl.common.types import Bools, Floats, Pairs, never
-from lmdsl.common.types import Stop as Stop
+from lmdsl.common.types import TimeUp as TimeUp
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model import stabilizable_set
@@ -23,7 +23,7 @@ def canonical(
     policy: Pairs,
     value: Floats,
     screen: Screen | None = None,
-    stop: Stop = never,
+    time_up: TimeUp = never,
 ) -> Pairs:
     """Break ties so that the policy reaches A: the policy that every backend ends with.
 
@@ -37,7 +37,7 @@ def canonical(
         The model, an optimal policy and its value.
     screen
         Lower bounds of the rivals of each cell's control at this value, where they are known.
-    stop
+    time_up
         Ends the work, with :class:`lmdsl.machine.deadline.Stopped`.
     """
     if screen is None:
@@ -65,14 +65,14 @@ def canonical(
     unit = np.ones(sub.K)
     w = _even(sub, start, lp.growth, np.ones(sub.n))
     if w is None:
-        w = evaluate(sub, start, lp.growth, unit, stop=stop)
+        w = evaluate(sub, start, lp.growth, unit, time_up=time_up)
     if w is None:
         start = sub._algorithm_1[1]
-        w = evaluate(sub, start, lp.growth, unit, stop=stop)
+        w = evaluate(sub, start, lp.growth, unit, time_up=time_up)
     if w is None:
         return policy
-    done = iterate(sub, start, w, lp.growth, unit, stop=stop)
-    if stop():
+    done = iterate(sub, start, w, lp.growth, unit, time_up=time_up)
+    if time_up():
         raise Stopped
     least = bellman.improve(sub, done.value, lp.growth, unit).value
     equal = bellman.tied(replace(sub, gamma=lp.growth, cost=unit), done.value, least, TIE)

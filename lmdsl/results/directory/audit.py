@@ -12,8 +12,7 @@ from lmdsl.certificate.checks import MEASURE_TOLERANCE
 from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
 from lmdsl.common.json_values import jsonable
-from lmdsl.control.invariance import SAMPLES, LocalCheck
-from lmdsl.control.invariance import check as check_local
+from lmdsl.control.invariance import SAMPLES, LocalCheck, examine
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.sampler import Sampler
 from lmdsl.model.local.controller import LocalController
@@ -201,8 +200,8 @@ def local_differences(
     else:
         local = LocalController.of(problem, lp.partition, attractor, deadline)
         assert local is not None
-        found = check_local(problem, local, deadline, samples=samples)
-        deadline.check("verifying")  # it ends with less than it could have found
+        found = examine(problem, local, deadline, samples=samples)
+        deadline.raise_if_over("verifying")  # it ends with less than it could have found
     true = {
         "kind": stored.kind == found.kind,
         "multiplier": _close(stored.multiplier, found.multiplier),
@@ -227,12 +226,12 @@ def _close(a: float | None, b: float | None) -> bool:
 
 def function_differences(lp: StabilizationLP, result: Result) -> list[str]:
     """Return where the saved rows of a function contradict what the file holds: sets and cost."""
-    from lmdsl.model.sets import Regions
+    from lmdsl.model.sets import CellSets
 
     reasons, status = [], result.cell_status
-    regions = Regions.of(result.problem, result.partition)
+    sets = CellSets.of(result.problem, result.partition)
     for code, mask in (
-        (CellStatus.ATTRACTOR, regions.attractor), (CellStatus.AVOID, regions.avoid),
+        (CellStatus.ATTRACTOR, sets.attractor), (CellStatus.AVOID, sets.avoid),
     ):  # fmt: skip
         if not np.array_equal(status == code, mask):
             reasons.append(f"cell_status differs from the {code.name.lower()} of the problem")

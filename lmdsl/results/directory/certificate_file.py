@@ -16,8 +16,8 @@ from lmdsl.common.strict_model import Declared, plain
 from lmdsl.control.invariance import LocalCheck
 from lmdsl.errors import BadInput
 from lmdsl.results.directory.reading import COMMIT
-from lmdsl.results.report import Seconds
 from lmdsl.results.status import Cause, Status
+from lmdsl.results.summary import Seconds
 
 SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
 

@@ -28,14 +28,14 @@ NAMES = ("problem.json", "solution.npz", "model.npz", COMMIT)
 """The files of a save; of the others in a directory none is read, replaced or removed."""
 SAVE = "[0-9a-f]{16}"
 TRIES = 100
-Found = TypeVar("Found")
+T = TypeVar("T")
 
 
 class Mixture(BadInput):
     """The files of a directory are not of one save."""
 
 
-def read(folder: Path, what: Callable[[Reading], Found]) -> Found:
+def read(folder: Path, what: Callable[[Reading], T]) -> T:
     """Read the files of one save, again where another save replaced them meanwhile.
 
     Raises

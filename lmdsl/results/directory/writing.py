@@ -256,12 +256,12 @@ def _tidy(target: Path) -> None:
 def _intact(target: Path) -> bool:
     """Return whether a directory holds the files of one save, whoever made it."""
 
-    def check(files: Reading) -> None:
+    def open_all(files: Reading) -> None:
         for name in files.digests:
             files.open(name)
 
     try:
-        read(target, check)
+        read(target, open_all)
     except Mixture:
         return False
     except BadInput:  # written, and not to be read by us

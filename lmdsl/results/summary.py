@@ -62,7 +62,7 @@ class Coverage:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Report(Frozen):
+class Summary(Frozen):
     """The scalar part of a result: the keys of ``lmdsl solve --json``, in order.
 
     Attributes
@@ -119,7 +119,7 @@ class Report(Frozen):
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
         covered, beyond, runs = self.coverage, self.beyond_gamma, self.simulation
-        names = [f.name for f in fields(Report) if f.name != "simulation"]
+        names = [f.name for f in fields(Summary) if f.name != "simulation"]
         return {
             **{name: jsonable(getattr(self, name)) for name in names},
             "beyond_gamma": beyond and beyond.to_dict(),
