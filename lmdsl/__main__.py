@@ -1,7 +1,5 @@
 """``python -m lmdsl``, and the command ``lmdsl``."""
 
-from __future__ import annotations
-
 import _thread
 import contextlib
 import os

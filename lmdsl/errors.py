@@ -1,7 +1,5 @@
 """The exceptions of lmdsl: every message says what is wrong, where, and what to do."""
 
-from __future__ import annotations
-
 from typing import Any
 
 

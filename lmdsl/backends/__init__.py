@@ -1,7 +1,5 @@
 """Who solves the LP: the registry, the wall around what backends say, and one file for each."""
 
-from __future__ import annotations
-
 from lmdsl.backends.base import Backend, Capabilities, Options, Solution, Stop
 from lmdsl.backends.registry import BUILT_IN as BUILT_IN
 from lmdsl.backends.registry import DEFAULT as DEFAULT

@@ -5,8 +5,6 @@ copied into plain arrays of our own, what it raises becomes a failure, and what 
 own copy of the model. Beyond this module a solution is data, right or wrong.
 """
 
-from __future__ import annotations
-
 import copy
 import os
 from dataclasses import replace
@@ -20,7 +18,7 @@ from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.policy_iteration import Iterated
 from lmdsl.backends.scaled import failure
 from lmdsl.common.frozen import freeze
-from lmdsl.common.types import Pairs
+from lmdsl.common.types import Floats, Pairs
 from lmdsl.errors import BadInput, MissingDependency, plain_text
 from lmdsl.machine import quiet
 from lmdsl.machine.deadline import Deadline
@@ -146,7 +144,7 @@ def _own(values: Any, count: int, kinds: str) -> NDArray[Any] | None:
     return np.array(array, order="C", subok=False)
 
 
-def _numbers(values: Any, count: int) -> NDArray[np.float64] | None:
+def _numbers(values: Any, count: int) -> Floats | None:
     array = _own(values, count, "fiu")
     if array is None:
         return None

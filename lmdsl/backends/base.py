@@ -15,11 +15,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from lmdsl.common.frozen import Frozen
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices
 
 if TYPE_CHECKING:
     from lmdsl.model.lp import StabilizationLP
@@ -110,8 +107,8 @@ class Options:
     time_limit: float | None = None
     max_iterations: int | None = None
     algorithm: str | None = None
-    start: NDArray[np.int64] | None = None
-    proof: NDArray[np.float64] | None = None
+    start: Indices | None = None
+    proof: Floats | None = None
     progress: Callable[[str, float], None] | None = None
 
 
@@ -141,7 +138,7 @@ class Solution:
     word: str
     value: Floats | None = None
     occupation: Floats | None = None
-    policy: NDArray[np.int64] | None = None
+    policy: Indices | None = None
     iterations: int | None = None
     details: Mapping[str, Any] = field(default_factory=dict)
 

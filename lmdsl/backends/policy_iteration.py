@@ -5,8 +5,6 @@ policy as far as the step was worth. The values fall and the last policy is opti
 and with zeros in the cost; for gamma >= 1 every policy on the way is gamma-stabilizing.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

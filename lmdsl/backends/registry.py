@@ -3,8 +3,6 @@
 An entry point names a :class:`Backend`. Nothing is imported before it is asked for.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterable
 from contextlib import suppress

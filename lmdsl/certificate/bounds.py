@@ -8,8 +8,6 @@ of doubles lose up to L * 2^-1074 times the largest factor, which is added apart
 doubles G, gamma, V are read as they stand and a transition is numerator / total.
 """
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

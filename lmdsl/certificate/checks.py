@@ -1,7 +1,5 @@
 """Every claim checked fast; what is extreme is judged exactly."""
 
-from __future__ import annotations
-
 import math
 from fractions import Fraction
 

@@ -16,8 +16,6 @@ stored doubles that holds in exact arithmetic (see bounds.py):
 A solver's status plays no part. A claim that almost holds is repaired or refused, never rounded.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 

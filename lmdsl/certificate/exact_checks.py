@@ -4,8 +4,6 @@ A claim that holds only with equality holds. Numbers are rounded at the end, cos
 the lower bound down.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction

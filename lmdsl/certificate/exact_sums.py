@@ -4,15 +4,12 @@ A double is an integer times a power of two and a transition is numerator / tota
 inequality becomes one between integers. Written for clarity: a few microseconds per transition.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, Guard, Pairs
+from lmdsl.common.types import Floats, Guard, Indices, Pairs
 from lmdsl.model.lp import StabilizationLP
 
 Row = list[tuple[int, int]]
@@ -21,7 +18,7 @@ BLOCK = 2**14
 
 
 def rows(
-    lp: StabilizationLP, columns: NDArray[np.int64], guard: Guard | None = None
+    lp: StabilizationLP, columns: Indices, guard: Guard | None = None
 ) -> Iterator[tuple[int, Row]]:
     """Yield (column, [(target in C, numerator), ...]), block by block; ``guard`` may raise."""
     numerator, n = lp.rows.shares.numerator, lp.n

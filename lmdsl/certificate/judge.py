@@ -1,7 +1,5 @@
 """The claims, one object each, and the judges: a witness in, a certificate out."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

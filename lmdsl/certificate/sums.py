@@ -4,8 +4,6 @@ Fast within a range in which nothing overflows or loses digits by underflow; exa
 outside.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from fractions import Fraction

@@ -6,8 +6,6 @@ solver failed or hit its limit; 1 solved but not verified. Results go to stdout,
 its module; what a command needs is imported when it runs.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import os

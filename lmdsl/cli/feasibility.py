@@ -1,7 +1,5 @@
 """``gamma-max`` and ``explain``: what can be stabilized, and why the rest cannot."""
 
-from __future__ import annotations
-
 from lmdsl.cli.output import Arguments, Command, ProgressLine, as_json, print_json
 from lmdsl.cli.streams import say
 

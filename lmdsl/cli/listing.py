@@ -1,7 +1,5 @@
 """What there is, and where to start: ``schema``, ``systems``, ``init``, ``backends``."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

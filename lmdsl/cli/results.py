@@ -1,7 +1,5 @@
 """What is done with a result directory: ``verify``, ``simulate``, ``plot``, ``export``."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from importlib import import_module

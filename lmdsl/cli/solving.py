@@ -1,7 +1,5 @@
 """``solve`` and ``compare``."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from dataclasses import replace

@@ -6,8 +6,6 @@ answers. A stream that cannot be written to (closed, full, or its reader gone) t
 from then on and loses it: it changes no exit status.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import os
@@ -18,8 +16,6 @@ from typing import Any
 
 from lmdsl.errors import printable
 from lmdsl.machine import quiet
-
-_answers: ContextVar[Stream | None] = ContextVar("answers", default=None)
 
 
 class Stream:
@@ -53,6 +49,9 @@ class Stream:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.stream, name)
+
+
+_answers: ContextVar[Stream | None] = ContextVar("answers", default=None)
 
 
 def say(text: str) -> None:

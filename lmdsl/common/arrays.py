@@ -5,8 +5,6 @@ the file, the archive's directory and the headers before anything is allocated. 
 loaded.
 """
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """What pydantic finds wrong, as one line: every fault with its path, the value and the fix."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterator, Mapping
 from types import UnionType

@@ -1,7 +1,5 @@
 """Files: bounded reading of strict JSON, and writing that happens whole or not at all."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

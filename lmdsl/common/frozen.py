@@ -1,7 +1,5 @@
 """Records that hold arrays: what they hold is never written to, and two of them can be compared."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any
 

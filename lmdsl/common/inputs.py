@@ -1,16 +1,13 @@
 """What callers pass to public functions: whole numbers, and states in any usual container."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput, shown
 
 MOST = 10**15
@@ -64,7 +61,7 @@ def kind(value: Any, kinds: Any, where: str, wanted: str) -> None:
         raise BadInput(f"{shown(value)} is not {wanted}", where)
 
 
-def indices(value: Any, count: int, where: str, what: str = "cells") -> NDArray[np.int64]:
+def indices(value: Any, count: int, where: str, what: str = "cells") -> Indices:
     """Return indices below a count, shape (r,)."""
     try:
         array = np.asarray(value)

@@ -1,7 +1,5 @@
 """Results as plain JSON data."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, is_dataclass
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """Names of types that every room uses: arrays by what they hold, and callables of the caller's."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -11,6 +9,8 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 """Whole numbers, such as cells, positions or columns."""
+Statuses = NDArray[np.uint8]
+"""Codes of ``CellStatus``, by cell."""
 Pairs = NDArray[np.int64]
 """A policy: a column per position of C, shape (n,); or any columns."""
 

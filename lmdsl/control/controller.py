@@ -1,7 +1,5 @@
 """The feedback controller, and closed-loop simulation of the true map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,16 +5,13 @@ is cut into boxes until the enclosed image of each meets attractor cells only. T
 proved of the map as computed, with its rounding, and so of what a simulation can do.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, Guard, Indices
+from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.formulas.enclosures import Jet, apply, enclosure
 from lmdsl.formulas.intervals import Interval, subtract
 from lmdsl.formulas.program import FUNCTION
@@ -147,7 +144,7 @@ def _stays(
     cell: Indices,
     nodes: Floats,
     deadline: Deadline,
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Return which states of attractor cells are mapped into A by every noise node."""
     u = local(x, cell)
     states, controls = list(x.T[:, :, None]), list(u.T[:, :, None])
@@ -265,9 +262,7 @@ def _closed(
     return images
 
 
-def _into(
-    partition: Partition, attractor: NDArray[np.bool_], images: list[Interval]
-) -> NDArray[np.bool_]:
+def _into(partition: Partition, attractor: Bools, images: list[Interval]) -> Bools:
     """Return which image boxes lie in the attractor: every cell that they may meet is one.
 
     These are the cells between those of the ends, since locating is monotone (axis.py).

@@ -1,7 +1,5 @@
 """Why cells cannot be stabilized, and what would help."""
 
-from __future__ import annotations
-
 from lmdsl.explanation.causes import Explanation, explain, phase_one
 from lmdsl.explanation.lost_mass import PhaseOne
 

@@ -1,18 +1,15 @@
 """Infeasibility explained: by cause and region, cell by cell, in mass, and what would help."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common import inputs
 from lmdsl.common.frozen import Frozen
-from lmdsl.common.types import Progress
+from lmdsl.common.types import Progress, Statuses
 from lmdsl.errors import BadInput, shown
 from lmdsl.explanation import one_cell
 from lmdsl.explanation.hints import Hint, hints
@@ -83,7 +80,7 @@ class Explanation(Frozen):
 
     problem: Problem
     partition: Partition
-    cell_status: NDArray[np.uint8]
+    cell_status: Statuses
     causes: tuple[LostCells, ...]
     hints: tuple[Hint, ...]
     phase_one: PhaseOne | None = None
@@ -296,9 +293,7 @@ def phase_one(problem: Problem, time_limit: float | Deadline | None = None) -> P
     return PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
 
 
-def _status(
-    partition: Partition, transitions: Transitions, deadline: Deadline
-) -> NDArray[np.uint8]:
+def _status(partition: Partition, transitions: Transitions, deadline: Deadline) -> Statuses:
     """Return the status of every cell, shape (N,)."""
     found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
     status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)

@@ -19,8 +19,6 @@ more controls  for cells that escape: along one control, with the others held at
 A hint is given if at least 5 % of the cells tried support it, and carries its numbers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.json_values import jsonable
-from lmdsl.common.types import Bools, Floats, Indices
+from lmdsl.common.types import Bools, Floats, Indices, Statuses
 from lmdsl.model.assembly.sampler import CHUNK, Sampler
 from lmdsl.model.discretization import control_values
 from lmdsl.model.grid.axis import EDGE
@@ -63,7 +61,7 @@ class Hint:
         return {"kind": self.kind, "text": self.text, "numbers": jsonable(self.numbers)}
 
 
-def hints(sampler: Sampler, status: NDArray[np.uint8]) -> tuple[Hint, ...]:
+def hints(sampler: Sampler, status: Statuses) -> tuple[Hint, ...]:
     """Return the hints that trials support, given the status of all cells (N,)."""
     lost = (
         (status == CellStatus.ESCAPES)
@@ -92,7 +90,7 @@ def _some(values: NDArray[Any], most: int) -> NDArray[Any]:
 class _Trial:
     """The true map on arrays of shape (cells, controls, points, nodes)."""
 
-    def __init__(self, sampler: Sampler, status: NDArray[np.uint8]) -> None:
+    def __init__(self, sampler: Sampler, status: Statuses) -> None:
         self.sampler, self.status, self.partition = sampler, status, sampler.partition
         self.points = _some(sampler.points, MOST_POINTS)
         self.nodes = _some(sampler.nodes.values, MOST_NODES)
@@ -113,7 +111,7 @@ class _Trial:
 
     def step(
         self, state: list[Floats], controls: list[Floats], shape: tuple[int, ...]
-    ) -> tuple[list[Floats], Floats, NDArray[np.int64]]:
+    ) -> tuple[list[Floats], Floats, Indices]:
         """Return images per axis, overshoot (2 d, *shape) by side, and status (-1 outside)."""
         p = self.partition
         named = self.sampler.true_map.named(state, controls, self.noise)

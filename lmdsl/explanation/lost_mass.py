@@ -18,16 +18,13 @@ A from cell i through admissible pairs, and with m > 0 everywhere the optimum is
 cell is stabilizable. For gamma > 1 it is positive also where gamma is too large.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common.frozen import Frozen
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.errors import LmdslError, shown
 from lmdsl.explanation.one_cell import NAMES
 from lmdsl.machine import apart, linprog, memory
@@ -67,8 +64,8 @@ class PhaseOne(Frozen):
     """
 
     partition: Partition
-    cells: NDArray[np.int64]
-    cause: NDArray[np.uint8]
+    cells: Indices
+    cause: Statuses
     weight: Floats
     residual: Floats
     lost: Floats
@@ -79,10 +76,10 @@ class PhaseOne(Frozen):
         cls,
         partition: Partition,
         transitions: Transitions,
-        status: NDArray[np.uint8],
+        status: Statuses,
         gamma: float,
         deadline: Deadline | None = None,
-    ) -> PhaseOne:
+    ) -> Self:
         """Solve the LP with HiGHS (interior point, then crossover).
 
         Raises
@@ -137,7 +134,7 @@ class PhaseOne(Frozen):
             }
         return found
 
-    def largest(self) -> NDArray[np.int64]:
+    def largest(self) -> Indices:
         """Return the positions of the cells that lose most, at most 100, largest first."""
         order = np.argsort(-self.lost, kind="stable")[:MOST_CELLS]
         return order[self.lost[order] > 0]

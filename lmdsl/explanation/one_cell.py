@@ -1,15 +1,13 @@
 """Why one cell is not stabilizable: what each control does to it, or the set it cannot leave."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common.frozen import Frozen
 from lmdsl.common.json_values import jsonable
+from lmdsl.common.types import Bools, Indices, Statuses
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.assembly.sampler import Block, Sampler
 from lmdsl.model.assembly.transitions import outcome
@@ -157,14 +155,14 @@ def _count(n: int, noun: str) -> str:
     return f"{n} {noun}{'s' * (n != 1)}"
 
 
-def moves(sampler: Sampler, status: NDArray[np.uint8], cell: int) -> tuple[Move, ...]:
+def moves(sampler: Sampler, status: Statuses, cell: int) -> tuple[Move, ...]:
     """Return what the controls do to a cell that escapes or leads to lost cells."""
     M = len(sampler.controls)
     picked = np.unique(np.linspace(0, M - 1, min(M, MOST_CONTROLS)).round().astype(int))
     return tuple(_move(sampler, status, cell, int(a)) for a in picked)
 
 
-def _move(sampler: Sampler, status: NDArray[np.uint8], cell: int, control: int) -> Move:
+def _move(sampler: Sampler, status: Statuses, cell: int, control: int) -> Move:
     p, nodes = sampler.partition, sampler.nodes
     flat = outcome(sampler, cell, control)
     code = np.where(flat < 0, CellStatus.AVOID, status[flat])
@@ -205,7 +203,7 @@ def _sides(p: Partition, image: list[float]) -> tuple[tuple[str, str, float], ..
     return tuple(found)
 
 
-def reachable(pair_pointer: NDArray[np.int64], rows: Rows, start: int) -> NDArray[np.bool_]:
+def reachable(pair_pointer: Indices, rows: Rows, start: int) -> Bools:
     """Return the free cells that runs from one of them can reach, the start included, (F,).
 
     It is the smallest set that contains the start and that no admissible pair leaves (but into A).

@@ -1,7 +1,5 @@
 """Names and formulas as declared keys: what a state, control, noise or parameter may be called."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field

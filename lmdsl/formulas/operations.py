@@ -1,7 +1,5 @@
 """What formulas can do: operations, functions and constants by name."""
 
-from __future__ import annotations
-
 import keyword
 import math
 from collections.abc import Callable, Mapping

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Guard
+from lmdsl.common.types import Floats, Guard
 from lmdsl.errors import BadInput
 from lmdsl.formulas.enclosures import Jet, apply
 from lmdsl.formulas.language import Formula, Subformula, fold
@@ -126,7 +126,7 @@ class Program:
 
     def __call__(
         self, values: Mapping[str, NDArray[Any] | float], guard: Guard | None = None
-    ) -> tuple[NDArray[np.float64], ...]:
+    ) -> tuple[Floats, ...]:
         """Evaluate all formulas.
 
         Parameters
@@ -158,7 +158,7 @@ class Program:
                 for k in released:
                     slots[k] = None
         aliases = set(self.variables.values())
-        results: list[NDArray[np.float64]] = []
+        results: list[Floats] = []
         for slot in self.outputs:  # no result shares memory with an input or another result
             result = np.asarray(slots[slot], dtype=np.float64)
             results.append(result.copy() if slot in aliases else result)

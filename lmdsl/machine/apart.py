@@ -6,8 +6,6 @@ arguments through a pipe, and is killed a moment after the deadline, or when the
 interrupted. The child imports no more than the function asks for.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pickle

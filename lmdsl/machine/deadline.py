@@ -1,7 +1,5 @@
 """One deadline for all that a call does, handed through; everything long asks it now and then."""
 
-from __future__ import annotations
-
 import math
 import time
 
@@ -35,7 +33,7 @@ class Deadline:
         self._at = math.inf if seconds is None else time.monotonic() + seconds
 
     @classmethod
-    def of(cls, limit: float | Deadline | None) -> Deadline:
+    def of(cls, limit: "float | Deadline | None") -> "Deadline":
         """Return a deadline as it is, a number of seconds as one that begins now.
 
         Raises
@@ -50,7 +48,7 @@ class Deadline:
             raise BadInput(f"{shown(limit)} must be a number of seconds > 0", "time_limit")
         return cls(None if limit is None else float(min(limit, FOREVER)))
 
-    def again(self) -> Deadline:
+    def again(self) -> "Deadline":
         """Return a deadline for finishing: as long again from now on, at least two seconds."""
         return Deadline(None if self.seconds is None else max(self.seconds, 2.0))
 

@@ -5,8 +5,6 @@ back, and a pool of threads of which the child knows has no members; waiting for
 So here nothing is locked that need not be, and who keeps threads can ask.
 """
 
-from __future__ import annotations
-
 import functools
 import os
 import sys

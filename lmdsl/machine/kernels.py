@@ -8,8 +8,6 @@ notices a change in a kernel that another calls and a changed constant, needs no
 checksum: what cannot be read, or is not what was written, is compiled again.
 """
 
-from __future__ import annotations
-
 import gc
 import hashlib
 import logging

@@ -1,7 +1,5 @@
 """A linear program solved by SciPy's HiGHS: all that a process of its own has to import."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

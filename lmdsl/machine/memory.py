@@ -5,8 +5,6 @@ in (version 1 or 2; systemd's slices and containers are such groups) with all gr
 the address space and data of ``ulimit``, and the share of a Slurm job.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

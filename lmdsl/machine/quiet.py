@@ -7,8 +7,6 @@ descriptor 1 by other ways meanwhile ends up in the log too, so this is done onl
 needed: a backend that is silent by its own options says so (``Capabilities.silent``).
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import io
@@ -29,7 +27,7 @@ _turn = threading.RLock()
 """Held while the streams are diverted or put back: no fork may happen in the middle."""
 forking.hold(_turn)
 _here = threading.local()
-_diverted: _Diverted | None = None
+_diverted: "_Diverted | None" = None
 _users = 0
 
 
@@ -141,7 +139,7 @@ class _Diverted:
             with contextlib.suppress(OSError, ValueError):
                 file.close()
 
-    def _is_ours(self, stream: Any, split: _Split) -> bool:
+    def _is_ours(self, stream: Any, split: "_Split") -> bool:
         """Return whether a standard stream is no use when this ends: whose it is, or was."""
         if stream is split or stream is None or getattr(stream, "closed", False) is True:
             return True

@@ -1,7 +1,5 @@
 """What callers and solvers must not change: whether and how lmdsl computes."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 from collections.abc import Callable

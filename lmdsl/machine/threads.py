@@ -5,8 +5,6 @@ the order of the parts: the outcome is the same to the last bit however many thr
 The environment variable ``NUMBA_NUM_THREADS`` limits their number.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 from collections import deque

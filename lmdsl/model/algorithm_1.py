@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Pairs
+from lmdsl.common.types import Bools, Indices, Pairs
 from lmdsl.machine import memory, threads
 from lmdsl.machine.kernels import ONE, fixed, kernel
 from lmdsl.model.rows import Rows
@@ -30,7 +30,7 @@ class Predecessors:
         Pair indices, int32 (int64 where needed), ascending for each target.
     """
 
-    pointer: NDArray[np.int64]
+    pointer: Indices
     pair: NDArray[Any]
 
     @classmethod
@@ -45,10 +45,8 @@ class Predecessors:
 
 
 def tree(
-    pair_pointer: NDArray[np.int64],
-    rows: Rows,
-    allowed: NDArray[np.bool_] | None = None,
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    pair_pointer: Indices, rows: Rows, allowed: Bools | None = None
+) -> tuple[NDArray[np.int32], Indices]:
     """Algorithm 1, corrected: breadth-first levels from A, and the pair that put a cell there.
 
     Parameters
@@ -83,11 +81,8 @@ SMALL = 2**20
 
 
 def _tree(
-    pair_pointer: NDArray[np.int64],
-    rows: Rows,
-    alive: NDArray[np.bool_],
-    before: Predecessors | None = None,
-) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    pair_pointer: Indices, rows: Rows, alive: Bools, before: Predecessors | None = None
+) -> tuple[NDArray[np.int32], Indices]:
     """Return levels and pairs as :func:`tree`; with predecessors at hand, by these alone."""
     cells = rows.columns
     level = np.full(cells + 1, -1, dtype=np.int32)
@@ -116,7 +111,7 @@ def _tree(
     return level[:-1], pair
 
 
-def owner(pair_pointer: NDArray[np.int64]) -> NDArray[np.int32]:
+def owner(pair_pointer: Indices) -> NDArray[np.int32]:
     """Return the cell of every pair, shape (pairs,)."""
     return np.repeat(np.arange(len(pair_pointer) - 1, dtype=np.int32), np.diff(pair_pointer))
 

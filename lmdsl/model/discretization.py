@@ -1,15 +1,12 @@
 """The finite grids of a problem: sample offsets within a cell, control vectors, noise nodes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices
 from lmdsl.machine import memory
 from lmdsl.problem.problem import Problem
 
@@ -73,7 +70,7 @@ class Nodes:
 
     values: Floats
     weights: Floats
-    group: NDArray[np.int64]
+    group: Indices
 
     def group_weights(self) -> list[float]:
         """Return the weight of each group."""

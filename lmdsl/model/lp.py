@@ -271,9 +271,7 @@ class StabilizationLP(Frozen):
 
 @own_arithmetic
 def compile(  # noqa: A001
-    problem: Problem,
-    progress: Progress | None = None,
-    time_limit: float | Deadline | None = None,
+    problem: Problem, progress: Progress | None = None, time_limit: float | Deadline | None = None
 ) -> StabilizationLP:
     """Compile a problem: transitions, stabilizable set and the LP on it.
 

@@ -9,17 +9,16 @@ The last target, ``columns``, is the attractor: a vector multiplied with the row
 entry, 0 there. Every row sums to exactly 1 with it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.frozen import Frozen
+from lmdsl.common.types import Floats, Indices
 from lmdsl.machine import threads
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.discretization import Nodes
@@ -46,11 +45,11 @@ class Shares(Frozen):
 
     numerator: Sequence[int]
     total: int
-    value: NDArray[np.float64]
+    value: Floats
     merged: bool = False
 
     @classmethod
-    def of(cls, points: int, nodes: Nodes) -> Shares:
+    def of(cls, points: int, nodes: Nodes) -> Self:
         """Return the codes of ``points`` sample points times noise nodes."""
         if len(nodes.weights) == 1:
             codes = points
@@ -88,7 +87,7 @@ class Rows(Frozen):
         Number of cells a row can reach besides the attractor.
     """
 
-    pointer: NDArray[np.int64]
+    pointer: Indices
     target: NDArray[np.int32]
     code: NDArray[np.unsignedinteger]
     shares: Shares
@@ -116,7 +115,7 @@ class Rows(Frozen):
             for j, c in zip(self.target[span], self.code[span], strict=True)
         ]
 
-    def take(self, rows: NDArray[np.integer]) -> Rows:
+    def take(self, rows: NDArray[np.integer]) -> "Rows":
         """Return some of the rows, in the given order."""
         chosen = np.ascontiguousarray(rows, dtype=np.int64).view(np.uint64)
         pointer = np.zeros(len(chosen) + 1, dtype=np.int64)

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Guard
+from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.errors import BadInput
 from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
@@ -41,13 +41,13 @@ class CellSets:
         Shape (N,), int32: position in ``free``; F for the attractor; -1 for avoid.
     """
 
-    attractor: NDArray[np.bool_]
-    avoid: NDArray[np.bool_]
-    mass: NDArray[np.float64]
-    free: NDArray[np.int64]
+    attractor: Bools
+    avoid: Bools
+    mass: Floats
+    free: Indices
     number: NDArray[np.int32]
 
-    def weight(self, cells: NDArray[np.integer]) -> NDArray[np.float64]:
+    def weight(self, cells: NDArray[np.integer]) -> Floats:
         """Return m on the cells of C: their mass scaled to sum 1, all zero where they have none."""
         mass = self.mass[cells]
         if mass.max(initial=0.0) > 1e290:
@@ -92,7 +92,7 @@ class CellSets:
         return cls(attractor, avoid, mass, free, number)
 
 
-def _mass(problem: Problem, partition: Partition, guard: Guard) -> NDArray[np.float64]:
+def _mass(problem: Problem, partition: Partition, guard: Guard) -> Floats:
     mass = np.ones(partition.size)
     measure = problem.measure
     if measure is None:
@@ -132,7 +132,7 @@ def _mass(problem: Problem, partition: Partition, guard: Guard) -> NDArray[np.fl
     return mass
 
 
-def _attractor(problem: Problem, partition: Partition, guard: Guard) -> NDArray[np.bool_]:
+def _attractor(problem: Problem, partition: Partition, guard: Guard) -> Bools:
     declared = problem.attractor
     points = (
         partition.around_point(

@@ -16,14 +16,13 @@ that is too slow; then, and to remove cells, passes run over the predecessors of
 visit per entry in all.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common.types import Bools, Indices, Statuses
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import kernel
@@ -63,15 +62,15 @@ class Stabilizable:
         Algorithm 1 on the surviving pairs, see :func:`tree`; each of shape (F,).
     """
 
-    inside: NDArray[np.bool_]
-    surviving: NDArray[np.bool_]
-    reaches: NDArray[np.bool_]
+    inside: Bools
+    surviving: Bools
+    reaches: Bools
     level: NDArray[np.int32]
-    pair: NDArray[np.int64]
+    pair: Indices
 
 
 def stabilizable(
-    pair_pointer: NDArray[np.int64], rows: Rows, deadline: Deadline | None = None
+    pair_pointer: Indices, rows: Rows, deadline: Deadline | None = None
 ) -> Stabilizable:
     """Return the greatest set from which A is reached almost surely, and the pairs it keeps."""
     deadline = Deadline.of(deadline)
@@ -94,7 +93,7 @@ def stabilizable(
         _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)
 
 
-def causes(found: Stabilizable, pair_pointer: NDArray[np.int64]) -> NDArray[np.uint8]:
+def causes(found: Stabilizable, pair_pointer: Indices) -> Statuses:
     """Return the status code of every free cell (see :class:`CellStatus`), shape (F,)."""
     status = np.full(len(found.inside), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
     status[~found.reaches] = CellStatus.TRAPPED
@@ -105,7 +104,7 @@ def causes(found: Stabilizable, pair_pointer: NDArray[np.int64]) -> NDArray[np.u
 
 def restrict(
     transitions: Transitions, found: Stabilizable
-) -> tuple[NDArray[np.int64] | slice, NDArray[np.int64], Rows]:
+) -> tuple[Indices | slice, Indices, Rows]:
     """Keep the surviving pairs and number the cells of C.
 
     Returns

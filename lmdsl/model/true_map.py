@@ -1,7 +1,5 @@
 """The true map x+ = T(x, u, w) of a problem, and the states and cells that its images become."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

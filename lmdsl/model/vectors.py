@@ -1,7 +1,5 @@
 """Vectors over C as compiled loops read them, and work split over ranges of its cells."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """Vectors below the cost of every policy: value iterates, rounded down."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

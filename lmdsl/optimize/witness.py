@@ -3,8 +3,6 @@
 Nothing here is trusted: the judge decides on what comes out.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

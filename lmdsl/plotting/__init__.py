@@ -1,7 +1,5 @@
 """Pictures of a problem and its result; matplotlib is imported when something is drawn."""
 
-from __future__ import annotations
-
 from lmdsl.plotting.closed_loop import trajectories as trajectories
 from lmdsl.plotting.page import figure as figure
 from lmdsl.plotting.plots import causes as causes

@@ -5,8 +5,6 @@ plots need no display and leave nothing behind. matplotlib is imported only when
 drawn. A layer takes any matplotlib axes.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Floats
+from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput, MissingDependency, shown
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.plotting.view import View, number, rectangles
@@ -266,7 +264,7 @@ def levels(ax: Any, view: View, values: Floats, grid: Floats, label: str) -> Non
     colour_bar.set_ticklabels([number(v) for v in level[kept]])
 
 
-def _thinned(n: int, zero: int, most: int = 11) -> NDArray[np.int64]:
+def _thinned(n: int, zero: int, most: int = 11) -> Indices:
     """Return at most so many of n levels, evenly spaced through ``zero``, with both ends if so."""
     step = -(-n // most)
     both = [s for s in range(step, 2 * step) if zero % s == 0 and (n - 1 - zero) % s == 0]

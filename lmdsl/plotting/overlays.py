@@ -1,7 +1,5 @@
 """Ink on top of the cells: orbits, runs, the graph of a map, remarks."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

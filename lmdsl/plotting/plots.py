@@ -15,10 +15,10 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lmdsl.common import inputs
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Statuses
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.machine.surroundings import own_arithmetic
@@ -308,7 +308,7 @@ def _on_stabilized(result: Result, values: Floats) -> Floats:
     return np.where(known, values, np.nan)
 
 
-def _codes(result: Result) -> NDArray[np.uint8]:
+def _codes(result: Result) -> Statuses:
     """Return the region of every cell: its status, or what a refusal says of it."""
     code = result.cell_status.copy()
     free = code == CellStatus.STABILIZED

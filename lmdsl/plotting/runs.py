@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lmdsl.common import inputs
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices
 from lmdsl.control.simulation import draw_starts
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
@@ -111,9 +111,7 @@ def starts_of(result: Result, starts: int | ArrayLike, seed: int) -> Floats:
     return x
 
 
-def closed_loop(
-    result: Result, x: Floats, steps: int, seed: int
-) -> tuple[Floats, NDArray[np.int64], int]:
+def closed_loop(result: Result, x: Floats, steps: int, seed: int) -> tuple[Floats, Indices, int]:
     """Run the true map under the controller until A, loss, or the step limit.
 
     Returns
@@ -142,7 +140,7 @@ def closed_loop(
     return np.array(points), cell, PIECES if fine else 1
 
 
-def _scatter(like: Floats, rows: NDArray[np.int64], values: Floats) -> Floats:
+def _scatter(like: Floats, rows: Indices, values: Floats) -> Floats:
     spread = np.full_like(like, np.nan)
     spread[rows] = values
     return spread

@@ -1,17 +1,15 @@
 """What a plot shows of the cells: one or two axes, the others cut or projected away."""
 
-from __future__ import annotations
-
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common import inputs
-from lmdsl.common.types import Bools, Floats
+from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput, shown
 from lmdsl.model.grid.partition import Partition
 
@@ -48,7 +46,7 @@ class View:
 
     partition: Partition
     axes: tuple[int, ...]
-    cell: NDArray[np.int64]
+    cell: Indices
 
     @classmethod
     def of(
@@ -57,7 +55,7 @@ class View:
         attractor: Bools,
         axes: Sequence[str] | None = None,
         at: Mapping[str, float] | None = None,
-    ) -> View:
+    ) -> Self:
         """Resolve a choice of axes; the default slice passes through the attractor's centre."""
         names, at = partition.names, {} if at is None else at
         inputs.kind(at, Mapping, "at", "a mapping; write {axis: value}")
@@ -136,7 +134,7 @@ def rectangles(mask: Bools, x: Floats, y: Floats) -> Floats:
     )
 
 
-def segments(points: Floats, view: View) -> tuple[Floats, NDArray[np.int64]]:
+def segments(points: Floats, view: View) -> tuple[Floats, Indices]:
     """Join successive states of runs by lines that break where a periodic axis wraps.
 
     Parameters

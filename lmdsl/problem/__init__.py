@@ -1,7 +1,5 @@
 """What a user declares: one model per key of a problem file."""
 
-from __future__ import annotations
-
 from lmdsl.problem.axes import Axis
 from lmdsl.problem.controls import ControlRange, ControlValues
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback

@@ -1,9 +1,7 @@
 """The axes of the state box."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated
+from typing import Annotated, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -33,7 +31,7 @@ class Axis(Declared):
     periodic: bool = False
 
     @model_validator(mode="after")
-    def _ordered(self) -> Axis:
+    def _ordered(self) -> Self:
         width = (self.high - self.low) / self.cells
         if not self.low < self.high:
             raise BadInput(f"low {self.low!r} must be less than high {self.high!r}")

@@ -1,9 +1,7 @@
 """The values that a control takes."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Tag, model_validator
@@ -31,7 +29,7 @@ class ControlRange(Declared):
     points: Count
 
     @model_validator(mode="after")
-    def _ordered(self) -> ControlRange:
+    def _ordered(self) -> Self:
         if self.points == 1 and self.low != self.high:
             raise BadInput(f"one point needs low == high, not {self.low!r} and {self.high!r}")
         if self.points > 1 and not self.low < self.high:
@@ -59,7 +57,7 @@ class ControlValues(Declared):
     values: Annotated[Numbers, SchemaWords({"uniqueItems": True})]
 
     @model_validator(mode="after")
-    def _distinct(self) -> ControlValues:
+    def _distinct(self) -> Self:
         seen: set[float] = set()
         for value in self.values:
             if value in seen:

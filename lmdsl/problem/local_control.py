@@ -1,7 +1,5 @@
 """Controllers on the attractor cells."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np

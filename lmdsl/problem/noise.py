@@ -1,9 +1,7 @@
 """The distributions of the noise."""
 
-from __future__ import annotations
-
 import math
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, Tag, model_validator
@@ -24,7 +22,7 @@ class NoiseValues(Declared):
     weights: Annotated[Numbers, EachWords({"minimum": 0, "maximum": 1 + 1e-9})]
 
     @model_validator(mode="after")
-    def _distribution(self) -> NoiseValues:
+    def _distribution(self) -> Self:
         if len(self.values) != len(self.weights):
             raise BadInput(
                 f"{len(self.weights)} weights for {len(self.values)} values; give one each",

@@ -4,12 +4,10 @@ Reading never runs code, opens no other file, and costs time and memory in propo
 file (at most 16 MiB). Geometry is resolved later, in partition.py.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -87,7 +85,7 @@ class Problem(Declared):
         return {key: value for key, value in data.items() if key != "$schema"}
 
     @model_validator(mode="after")
-    def _consistent(self) -> Problem:
+    def _consistent(self) -> Self:
         self._unique_names()
         self._axes_named()
         self._local_named()

@@ -1,7 +1,5 @@
 """The sample points of a cell."""
 
-from __future__ import annotations
-
 import warnings
 from typing import TYPE_CHECKING, Literal
 

@@ -1,7 +1,5 @@
 """The JSON Schema of problem files."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from pydantic.json_schema import GenerateJsonSchema

@@ -1,9 +1,7 @@
 """Sets of cells: the attractor, what is to be avoided, and where runs start."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Self
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
@@ -67,7 +65,7 @@ class Attractor(Declared):
     cells: CellIndices = ()
 
     @model_validator(mode="after")
-    def _something(self) -> Attractor:
+    def _something(self) -> Self:
         if not (self.points or self.boxes or self.cells):
             raise BadInput("no attractor cell; give points, boxes or cells")
         return self
@@ -104,7 +102,7 @@ class Measure(Declared):
     weights: Annotated[Numbers, EachWords({"minimum": 0})] | None = None
 
     @model_validator(mode="after")
-    def _one_kind(self) -> Measure:
+    def _one_kind(self) -> Self:
         if self.boxes is None and self.density is None and self.weights is None:
             raise BadInput("give boxes, a density or weights")
         if self.density is not None and self.weights is not None:

@@ -1,13 +1,9 @@
 """The kinds of systems that a problem can name."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import (
-    BeforeValidator,
-)
+from pydantic import BeforeValidator
 
 from lmdsl.errors import BadInput
 from lmdsl.problem.unions import kinds

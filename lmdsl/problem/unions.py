@@ -1,7 +1,5 @@
 """Unions of models: told apart by ``kind``, or by a key that only one of them has."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Annotated, Any
 

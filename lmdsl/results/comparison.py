@@ -1,7 +1,5 @@
 """Several backends on the same LP, side by side."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

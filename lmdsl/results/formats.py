@@ -4,8 +4,6 @@ A format NAME is a module ``lmdsl/results/exports/NAME.py`` with ``write(result,
 line here. Nothing is imported before it is asked for.
 """
 
-from __future__ import annotations
-
 FORMATS = {
     "certificate": "to be checked alone",
     "drn": "for Storm",

@@ -1,16 +1,14 @@
 """What is known while a problem is solved, and the result made of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.backends import Backend, Solution
 from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Certificate, Verified, Witness
+from lmdsl.common.types import Floats
 from lmdsl.control.invariance import examine
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.discretization import control_count, control_vectors
@@ -63,11 +61,7 @@ class _Job:
     """What is known before a result exists; makes the result."""
 
     def __init__(
-        self,
-        lp: StabilizationLP,
-        backend: str,
-        tolerance: float,
-        compile_seconds: float | None,
+        self, lp: StabilizationLP, backend: str, tolerance: float, compile_seconds: float | None
     ) -> None:
         self.lp, self.backend, self.tolerance = lp, backend, tolerance
         self.compile_seconds = compile_seconds
@@ -96,7 +90,7 @@ class _Job:
             gamma_bar=gamma_bar,
         )
 
-    def restricted(self, inner: Result, w: NDArray[np.float64]) -> Result:
+    def restricted(self, inner: Result, w: Floats) -> Result:
         """Add to the result on the feasible cells the proof that the others are infeasible."""
         count = int((w > 0).sum())
         return replace(

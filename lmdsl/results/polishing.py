@@ -1,15 +1,12 @@
 """A backend's policy improved until nothing is strictly better, ties broken."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.backends import Solution
 from lmdsl.certificate import checks
-from lmdsl.common.types import Pairs
+from lmdsl.common.types import Floats, Pairs
 from lmdsl.machine.deadline import Deadline, Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.policies import bellman, evaluation, ties
@@ -22,7 +19,7 @@ class _Outcome:
     """A policy after polishing, and what polishing did."""
 
     policy: Pairs
-    value: NDArray[np.float64] | None
+    value: Floats | None
     steps: int
     gap_before: float | None
 
@@ -98,5 +95,5 @@ def _tidied(
     return _Outcome(done.policy, value, steps, gap_before)
 
 
-def _usable(lp: StabilizationLP, policy: Pairs, guess: NDArray[np.float64] | None) -> bool:
+def _usable(lp: StabilizationLP, policy: Pairs, guess: Floats | None) -> bool:
     return lp.gamma < 1 or evaluation.stability_vector(lp, policy, guess)[0] is not None

@@ -15,7 +15,7 @@ from lmdsl.certificate.claims import Certificate
 from lmdsl.common import inputs
 from lmdsl.common.frozen import freeze
 from lmdsl.common.json_values import jsonable
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Statuses
 from lmdsl.control.controller import Controller
 from lmdsl.control.simulation import ClosedLoop, Simulation, simulate
 from lmdsl.errors import BadInput, shown
@@ -109,7 +109,7 @@ class Result(Summary):
     value: Floats
     lower: Floats
     measure: Floats
-    cell_status: NDArray[np.uint8]
+    cell_status: Statuses
     witness: Floats
     control_vectors: Floats
     iterations: int | None = None

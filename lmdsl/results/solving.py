@@ -1,7 +1,5 @@
 """The pipeline: problem -> LP -> backend -> policy -> certificate -> result."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import dataclass

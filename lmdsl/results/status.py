@@ -1,7 +1,5 @@
 """The words for how a solve ended, and why a problem cannot be stabilized."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 
 

@@ -1,15 +1,13 @@
 """The scalar part of a result."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field, fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common.frozen import Frozen
 from lmdsl.common.json_values import jsonable
+from lmdsl.common.types import Statuses
 from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.simulation import Simulation
 from lmdsl.model.grid.boxes import Area
@@ -43,7 +41,7 @@ class Coverage:
     share: float | None
 
     @classmethod
-    def of(cls, cell_status: NDArray[np.uint8]) -> Coverage:
+    def of(cls, cell_status: Statuses) -> Self:
         """Count the cells."""
         free = int((~np.isin(cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID))).sum())
         stabilizable = int((cell_status == CellStatus.STABILIZED).sum())

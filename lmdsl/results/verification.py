@@ -4,8 +4,6 @@ Nothing in the directory is trusted: the finite model is made anew from the prob
 vectors are checked against it by the same inequalities that certified them.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Systems x+ = T(x, u, w): the generic kinds, and one short file per system known by name."""
 
-from __future__ import annotations
-
 from lmdsl.systems.base import MapSystem as MapSystem
 from lmdsl.systems.base import OdeSystem as OdeSystem
 from lmdsl.systems.base import System as System

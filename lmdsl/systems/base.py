@@ -6,8 +6,6 @@ Formulas and users' own Python functions meet this one contract, so everything d
 values.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal, Protocol

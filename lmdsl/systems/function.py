@@ -4,8 +4,6 @@ The function is the user's: it gets copies that it cannot write to, its images a
 arrays of doubles, and before and after a compilation it is asked the same question several ways.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
@@ -120,7 +118,7 @@ class FunctionMap:
             raise BadInput(f"the function returned {count}; {needed}", WHERE)
         return ordered
 
-    def audit(self, values: Mapping[str, Any]) -> Audit:
+    def audit(self, values: Mapping[str, Any]) -> "Audit":
         """Return what it answers to some samples; refuse it unless a second try agrees."""
         return Audit(self, values)
 

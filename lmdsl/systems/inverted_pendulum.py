@@ -1,7 +1,5 @@
 """The torque-limited pendulum."""
 
-from __future__ import annotations
-
 from math import pi
 from typing import ClassVar, Literal
 

@@ -1,7 +1,5 @@
 """The controlled logistic map."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from lmdsl.systems.named import NamedMap

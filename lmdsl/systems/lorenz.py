@@ -1,7 +1,5 @@
 """The Lorenz system, controlled through the Rayleigh number."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from lmdsl.common.strict_model import Positive

@@ -1,10 +1,8 @@
 """Systems with a name: formulas written once, parameters to choose."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 from pydantic import model_validator
 
@@ -28,7 +26,7 @@ class NamedSystem(System):
     problem: ClassVar[Mapping[str, Any]] = {}
 
     @model_validator(mode="after")
-    def _known_parameters(self) -> NamedSystem:
+    def _known_parameters(self) -> Self:
         for name in self.parameters:
             if name not in self.defaults:
                 known = ", ".join(self.defaults) or "none"

@@ -1,7 +1,5 @@
 """The inverted pendulum on a cart, reduced to the pendulum."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from lmdsl.common.strict_model import Positive

@@ -1,7 +1,5 @@
 """The controlled standard map, the example of the paper."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 from lmdsl.systems.named import NamedMap

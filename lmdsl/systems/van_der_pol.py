@@ -1,7 +1,5 @@
 """The controlled van der Pol oscillator."""
 
-from __future__ import annotations
-
 from typing import ClassVar, Literal
 
 from lmdsl.common.strict_model import Positive

@@ -4,8 +4,6 @@
 claims against what it returns. The record of capabilities decides which checks apply.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from lmdsl import backends

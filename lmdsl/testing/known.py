@@ -3,8 +3,6 @@
 Cell 0 is the attractor everywhere, so the cells of C are 1, 2, ... Write g for gamma.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -184,12 +182,7 @@ def _series(share: float) -> float:
 
 
 def _data(
-    motion: str,
-    cells: int,
-    controls: dict[str, Any],
-    cost: str,
-    gamma: float,
-    per_axis: int = 1,
+    motion: str, cells: int, controls: dict[str, Any], cost: str, gamma: float, per_axis: int = 1
 ) -> dict[str, Any]:
     """Return a problem on cells of width 1; one sample per cell is its centre."""
     return {

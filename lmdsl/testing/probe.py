@@ -1,7 +1,5 @@
 """Asks a backend and judges what comes back; one :class:`Probe` per backend and algorithm."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """What a run of the contract suite says."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

@@ -7,23 +7,18 @@ a time, locates the images and sums the costs. Plain arithmetic is correctly rou
 are those of NumPy. Formulas with a sine of the control, say, go the other way (sampler.py).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices
 from lmdsl.formulas.operations import PLAIN
 from lmdsl.formulas.program import Instruction, Program
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.assembly.merging import add_cost, settle_cost
 from lmdsl.model.grid.axis import AxisCells, circle, interval
-
-Integers = NDArray[np.int64]
 
 LINE = 512
 """Samples at a time: a dozen lines of them fit into the first-level cache."""
@@ -55,12 +50,12 @@ class Lines:
 
     early: Program
     varying: tuple[int, ...]
-    tape: Integers
+    tape: Indices
     constants: Floats
     rows: int
 
     @classmethod
-    def of(cls, program: Program, controls: Collection[str]) -> Lines | None:
+    def of(cls, program: Program, controls: Collection[str]) -> Self | None:
         """Split a program; None where that does not pay, or large arrays need more than arithmetic.
 
         Parameters
@@ -152,11 +147,11 @@ class _Inputs(NamedTuple):
     """
 
     flat: Floats
-    start: Integers
-    stride: Integers
+    start: Indices
+    stride: Indices
 
     @classmethod
-    def of(cls, arrays: Sequence[Floats]) -> _Inputs:
+    def of(cls, arrays: Sequence[Floats]) -> Self:
         start, stride = np.zeros(len(arrays), np.int64), np.zeros((len(arrays), 4), np.int64)
         used = 0
         for k, array in enumerate(arrays):

@@ -4,8 +4,6 @@ The samples of many pairs stand side by side, one lane per pair. So the steps th
 samples alike (sorting, summing the cost) run on vectors of pairs.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

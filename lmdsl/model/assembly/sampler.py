@@ -6,16 +6,13 @@ not depend on the control is computed once for all controls, and NumPy's inner l
 Plain arithmetic with the control is done line by line instead (lines.py), to the same bits.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices
 from lmdsl.formulas.program import Program
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import fixed
@@ -52,7 +49,7 @@ class Block(NamedTuple):
     """
 
     first: int
-    cells: NDArray[np.int64]
+    cells: Indices
     controls: tuple[int, int]
 
     @property
@@ -119,7 +116,7 @@ class Sampler:
         self._control = np.ascontiguousarray(self.controls.T)
         self._noise = np.ascontiguousarray(self.nodes.values.T)[:, None, None, :, None]
 
-    def blocks(self, cells: NDArray[np.int64]) -> Iterator[Block]:
+    def blocks(self, cells: Indices) -> Iterator[Block]:
         """Yield blocks of about CHUNK samples, ordered by cell, then control."""
         M = len(self.controls)
         lanes = max(1, CHUNK // self.samples)
@@ -143,7 +140,7 @@ class Sampler:
         controls = u[:, :, None, None, None] if cells_last else u[:, None, None, None, :]
         return self.true_map.named(states, list(controls), list(self._noise))
 
-    def audit(self, cells: NDArray[np.int64]) -> Audit | None:
+    def audit(self, cells: Indices) -> Audit | None:
         """Ask a user's function about a few pairs, before all; None for formulas.
 
         From then on, of every block some samples are asked for again.

@@ -7,8 +7,6 @@ floor(t + 1e-9), t = (x - low) / width. Before the modulus both steps are monoto
 the cells of all images between two are those between the cells of the two.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -6,15 +6,13 @@ left, so every box holds cells of the set only and no cell is counted twice. A p
 per cell and axis. On a periodic axis boxes grow across the seam.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common.frozen import Frozen
+from lmdsl.common.types import Bools, Indices
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.grid.partition import Partition
@@ -67,12 +65,12 @@ class Area(Frozen):
         Number of the cells in none of these boxes.
     """
 
-    cells: NDArray[np.int64]
+    cells: Indices
     regions: tuple[Region, ...]
     elsewhere: int
 
     @classmethod
-    def of(cls, partition: Partition, cells: NDArray[np.int64], limit: int = MOST_REGIONS) -> Area:
+    def of(cls, partition: Partition, cells: Indices, limit: int = MOST_REGIONS) -> Self:
         """Describe cells, given by their indices, with at most ``limit`` boxes."""
         mask = np.zeros(partition.size, dtype=np.bool_)
         mask[cells] = True
@@ -106,7 +104,7 @@ def shown(box: Ends) -> str:
     return ", ".join(f"{name} in [{a + 0.0:.6g}, {b + 0.0:.6g}]" for name, (a, b) in box.items())
 
 
-def regions(partition: Partition, mask: NDArray[np.bool_], limit: int) -> tuple[Region, ...]:
+def regions(partition: Partition, mask: Bools, limit: int) -> tuple[Region, ...]:
     """Return at most ``limit`` disjoint boxes of cells of a mask (N,), largest first."""
     left = mask.copy()
     d = partition.dimension
@@ -125,7 +123,7 @@ def regions(partition: Partition, mask: NDArray[np.bool_], limit: int) -> tuple[
     return tuple(sorted(found, key=lambda region: (-region.cells, region.cell)))
 
 
-def ends(partition: Partition, first: NDArray[np.int64], count: NDArray[np.int64]) -> Ends:
+def ends(partition: Partition, first: Indices, count: Indices) -> Ends:
     """Return the ends of ``count`` cells from ``first`` on every axis."""
     box = {}
     for k, name in enumerate(partition.names):
@@ -147,12 +145,7 @@ def of_cell(partition: Partition, cell: int) -> Ends:
     return ends(partition, first, np.ones_like(first))
 
 
-def _region(
-    partition: Partition,
-    first: NDArray[np.int64],
-    count: NDArray[np.int64],
-    stride: NDArray[np.int64],
-) -> Region:
+def _region(partition: Partition, first: Indices, count: Indices, stride: Indices) -> Region:
     middle = int((((first + count // 2) % partition.cells) * stride).sum())
     return Region(ends(partition, first, count), int(np.prod(count)), middle)
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common.types import Indices
 from lmdsl.machine.forking import cached_property
 
 MOST_FLIPPED = 2
@@ -101,7 +102,7 @@ class Directions:
         ])  # fmt: skip
 
     @cached_property
-    def cycle(self) -> NDArray[np.int64]:
+    def cycle(self) -> Indices:
         """Order and whether it is taken downwards, for every sweep of a cycle, shape (2 m, 2)."""
         m = 2 ** len(self._flipped)
         steps = np.arange(2 * m)

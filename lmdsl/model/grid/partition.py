@@ -6,11 +6,10 @@ One rule (axis.py) decides this for compilation, controller, simulation and proo
 they can never disagree about an edge.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +52,7 @@ class Partition(Frozen):
     clip: bool = False
 
     @classmethod
-    def of(cls, problem: Problem) -> Partition:
+    def of(cls, problem: Problem) -> Self:
         """Return the partition that a problem declares.
 
         Raises

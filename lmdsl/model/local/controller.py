@@ -6,19 +6,16 @@ attractor cell belongs to the orbit point nearest to its centre. Controls are cl
 of the control grid. Together they are the paper's feedback: C0 near the attractor, C1 outside.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common.frozen import Frozen
-from lmdsl.common.types import Floats, Indices
+from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.discretization import control_range
@@ -59,7 +56,7 @@ class LocalController(Frozen):
     """
 
     partition: Partition
-    attractor: NDArray[np.bool_]
+    attractor: Bools
     orbit: Floats
     control: Floats
     gain: Floats
@@ -72,9 +69,9 @@ class LocalController(Frozen):
         cls,
         problem: Problem,
         partition: Partition,
-        attractor: NDArray[np.bool_],
+        attractor: Bools,
         deadline: Deadline | None = None,
-    ) -> LocalController | None:
+    ) -> Self | None:
         """Return the local controller of a problem, None where it names none.
 
         Raises
@@ -176,7 +173,7 @@ def _within(control: Floats, low: Floats, high: Floats, names: tuple[str, ...]) 
                 )
 
 
-def _inside(orbit: Floats, partition: Partition, attractor: NDArray[np.bool_]) -> None:
+def _inside(orbit: Floats, partition: Partition, attractor: Bools) -> None:
     for k, point in enumerate(orbit):
         where = f"local_controller.orbit[{k}]"
         block = partition.around_point([float(x) for x in point], where)

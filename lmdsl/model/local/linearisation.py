@@ -1,7 +1,5 @@
 """The true map along an orbit: whether it is one, and the derivatives there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -8,8 +8,6 @@ with the periodic solution (Bittanti and Colaneri, Periodic Systems, 2009). A do
 equation, a sum of matrices >= 0.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from lmdsl.common.types import Floats

@@ -1,7 +1,5 @@
 """A first stabilizing policy for a gamma, or a proof that there is none."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -17,8 +17,6 @@ stabilizing at that gamma: a better policy, from which to go on. Policy iteratio
 just below the limit takes most steps at once, and halving the bracket bounds their number.
 """
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 from dataclasses import dataclass
@@ -207,17 +205,13 @@ def enclosed(lp: StabilizationLP, low: float, high: float) -> tuple[float, float
     proved = 0.0, math.inf
     for width in (WIDTH, LEAST_WIDTH):
         search = _Search(lp, never, lp._algorithm_1[1], width)
-        search.time_up = partial(_inside, search, low, high)
+        search.time_up = partial(search.within, low, high)
         with suppress(Stopped):
             search.run(60)
         proved = max(proved[0], search.low), min(proved[1], search.high)
         if proved[0] >= low and proved[1] <= high:
             break
     return proved
-
-
-def _inside(search: _Search, low: float, high: float) -> bool:
-    return search.low >= low and search.high <= high
 
 
 class _Search:
@@ -234,6 +228,9 @@ class _Search:
     @property
     def closed(self) -> bool:
         return self.high <= self.low * (1 + self.width)
+
+    def within(self, low: float, high: float) -> bool:
+        return self.low >= low and self.high <= high
 
     def run(self, limit: int, start: PolicyClasses | None = None) -> None:
         """Narrow the bracket until it closes, or doubles decide no more."""

@@ -1,7 +1,5 @@
 """Cells from which no policy has finite cost at a gamma: found, confined, checked."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 
 import numpy as np

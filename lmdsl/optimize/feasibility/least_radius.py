@@ -1,7 +1,5 @@
 """Howard's iteration for the policy of least spectral radius."""
 
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 

@@ -1,7 +1,5 @@
 """Perron vectors of classes, by Noda's iteration."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What gamma leaves out: the cells proved infeasible, and the problem on the others."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -7,8 +7,6 @@ each slow class on a way to A, and no more. So a chain of tens of equal slow cla
 grow over hundreds of decades, costs one pass.
 """
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Iterator
@@ -16,10 +14,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Bools, Floats, Pairs, TimeUp, never
+from lmdsl.common.types import Bools, Floats, Indices, Pairs, TimeUp, never
 from lmdsl.machine.forking import cached_property
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility.perron import FINE, _perron, _scale
@@ -63,8 +60,8 @@ class PolicyClasses:
 
     policy: Pairs
     P: Any
-    order: NDArray[np.int64]
-    ends: NDArray[np.int64]
+    order: Indices
+    ends: Indices
     x: Floats
     rate: Floats
     known: float

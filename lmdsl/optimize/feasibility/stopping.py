@@ -1,7 +1,5 @@
 """Optimal stopping: whether going on under weight gamma beats an end, cell by cell."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

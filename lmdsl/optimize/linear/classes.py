@@ -1,16 +1,13 @@
 """x = b + M x class by class, each communicating class after those it leads to."""
 
-from __future__ import annotations
-
 import threading
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, TimeUp, never
+from lmdsl.common.types import Floats, Indices, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.kernels import kernel
 from lmdsl.optimize.linear.gauss_seidel import CEILING
@@ -47,7 +44,7 @@ def solve_by_class(M: Any, b: Floats, time_up: TimeUp = never) -> tuple[Floats |
     return x, True
 
 
-def classes(M: Any) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def classes(M: Any) -> tuple[Indices, Indices]:
     """Return the cells ordered by strongly connected class, and where each class ends.
 
     Every class comes after all it leads to: class k is ``order[ends[k - 1]:ends[k]]``.
@@ -61,7 +58,7 @@ def classes(M: Any) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return np.argsort(rank[label], kind="stable"), np.cumsum(lengths)
 
 
-def _solve_class(M: Any, b: Floats, x: Floats, cells: NDArray[np.int64]) -> bool:
+def _solve_class(M: Any, b: Floats, x: Floats, cells: Indices) -> bool:
     """Solve one strongly connected class in place; False where it has no finite solution."""
     rows = M[cells]
     known = b[cells] + rows @ x

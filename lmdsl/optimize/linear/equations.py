@@ -11,15 +11,12 @@ Values may then span hundreds of decades, as a chain of slow classes makes them 
 is still solved to its own precision. Whether an answer is good enough is judged by the certificate.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, TimeUp, never
+from lmdsl.common.types import Bools, Floats, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.optimize.linear import extrapolation
 from lmdsl.optimize.linear.classes import _spread, solve_by_class
@@ -266,7 +263,7 @@ def _krylov(
     return guess
 
 
-def _pays(system: SplitMatrix, b: Floats) -> NDArray[np.bool_]:
+def _pays(system: SplitMatrix, b: Floats) -> Bools:
     """Return where x > 0: the cells from which some b > 0 can be reached."""
     pays, before = b > 0, system.transposed()
     _spread(before.begin, before.end, before.indices, pays)

@@ -4,8 +4,6 @@ Both take a few Jacobi steps, after which the residual is nearly that mode, and 
 as every component allows: down to just above the solution of x = b + M x, or up to above it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from lmdsl.common.types import Floats

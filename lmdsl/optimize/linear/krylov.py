@@ -1,7 +1,5 @@
 """Krylov's method BiCGSTAB on a cycle of sweeps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

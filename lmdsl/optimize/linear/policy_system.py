@@ -1,13 +1,10 @@
 """The system of a policy, x = b + gamma P_u x: rows of the model made ready for sweeps."""
 
-from __future__ import annotations
-
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Pairs
+from lmdsl.common.types import Indices, Pairs
 from lmdsl.machine import threads
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.grid.directions import Directions
@@ -31,9 +28,7 @@ class Slots:
         Orders in which sweeps visit the cells.
     """
 
-    def __init__(
-        self, rows: Rows, capacity: NDArray[np.int64], gamma: float, directions: Directions
-    ) -> None:
+    def __init__(self, rows: Rows, capacity: Indices, gamma: float, directions: Directions) -> None:
         self.rows, self.gamma = rows, gamma
         ends = np.cumsum(capacity)
         count, entries = len(capacity), int(ends[-1]) if len(capacity) else 0
@@ -48,9 +43,7 @@ class Slots:
         )
 
     @classmethod
-    def of(
-        cls, rows: Rows, pair_pointer: NDArray[np.int64], gamma: float, directions: Directions
-    ) -> Slots:
+    def of(cls, rows: Rows, pair_pointer: Indices, gamma: float, directions: Directions) -> Self:
         """Make room for any policy, a pair of each cell's own."""
         capacity = np.empty(len(pair_pointer) - 1, dtype=np.int64)
 
@@ -60,7 +53,7 @@ class Slots:
         threads.each(longest, spans(len(capacity)))
         return cls(rows, capacity, gamma, directions)
 
-    def system(self, chosen: NDArray[np.int64]) -> SplitMatrix:
+    def system(self, chosen: Indices) -> SplitMatrix:
         """Return gamma P for one row of each cell; it holds until the next call."""
         now = chosen.view(np.uint64)
 

@@ -10,14 +10,13 @@ from cells already known. The transposed system, which a measure satisfies, goes
 flows down to the core, which is solved last.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices
 from lmdsl.machine import threads
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.kernels import ONE, kernel
@@ -54,12 +53,12 @@ class Peeled:
 
     system: SplitMatrix
     order: CellNumbers
-    levels: NDArray[np.int64]
+    levels: Indices
     core: CellNumbers
     inner: SplitMatrix
 
     @classmethod
-    def of(cls, system: SplitMatrix) -> Peeled:
+    def of(cls, system: SplitMatrix) -> Self:
         """Find the core of a system."""
         n = len(system.begin)
         order = np.empty(n + int(BYTE), dtype=np.uint32)

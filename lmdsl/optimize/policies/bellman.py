@@ -3,14 +3,11 @@
 One compiled loop per idea. Vectors over C carry one more entry, 0, for the attractor.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, Pairs
+from lmdsl.common.types import Bools, Floats, Pairs
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.vectors import over_cells, padded
@@ -36,10 +33,7 @@ class Improvement:
 
 
 def improve(
-    lp: StabilizationLP,
-    V: Floats,
-    gamma: float | None = None,
-    cost: Floats | None = None,
+    lp: StabilizationLP, V: Floats, gamma: float | None = None, cost: Floats | None = None
 ) -> Improvement:
     """Apply the Bellman operator to V, shape (n,).
 
@@ -90,7 +84,7 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
     return Improvement(value, policy)
 
 
-def below(lp: StabilizationLP, V: Floats, limit: Floats) -> NDArray[np.bool_]:
+def below(lp: StabilizationLP, V: Floats, limit: Floats) -> Bools:
     """Return the columns with Q <= limit at V, shape (K,); ``limit`` has shape (n,)."""
     found, x = np.empty(lp.K, dtype=np.bool_), padded(V)
 
@@ -104,7 +98,7 @@ def below(lp: StabilizationLP, V: Floats, limit: Floats) -> NDArray[np.bool_]:
     return found
 
 
-def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> NDArray[np.bool_]:
+def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> Bools:
     """Return the columns with Q <= Q_min + tolerance |Q_min|, shape (K,)."""
     return below(lp, V, best + tolerance * np.abs(best))
 

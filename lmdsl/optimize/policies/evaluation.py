@@ -1,7 +1,5 @@
 """The cost of a policy, and the vector that proves it stabilizing."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lmdsl.certificate import bounds

@@ -6,8 +6,6 @@ value iterates from 0, which stay below V and rise. So the solver gets a smaller
 the same optimum. What it answers is certified over all pairs all the same.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from lmdsl.common.types import Floats, Pairs, TimeUp, never

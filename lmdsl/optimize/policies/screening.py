@@ -10,14 +10,11 @@ A bound for every pair would leave out more rows, but takes longer than it saves
 all rows of a cell in less time than it takes to find out which of them to read.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, Pairs
+from lmdsl.common.types import Bools, Floats, Pairs
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model import vectors
@@ -117,9 +114,7 @@ class Screen:
         self.policy = new
         return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
 
-    def tied(
-        self, V: Floats, tolerance: float, policy: Pairs
-    ) -> tuple[NDArray[np.bool_], Pairs, bool]:
+    def tied(self, V: Floats, tolerance: float, policy: Pairs) -> tuple[Bools, Pairs, bool]:
         """Find the columns with Q <= Q_min + tolerance |Q_min| at V, and those of a policy.
 
         Parameters

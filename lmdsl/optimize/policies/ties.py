@@ -1,7 +1,5 @@
 """Ties between controls, broken in favour of what people expect: the same control next door."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -5,8 +5,6 @@ also model.npz, the compiled rows. Arrays are accepted only with the shape and t
 implies.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

@@ -1,17 +1,15 @@
 """What a certificate.json says, compared with what was found anew: every number that is a claim."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.certificate.checks import MEASURE_TOLERANCE
 from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
 from lmdsl.common.json_values import jsonable
+from lmdsl.common.types import Floats
 from lmdsl.control.invariance import SAMPLES, LocalCheck, examine
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.sampler import Sampler
@@ -245,7 +243,7 @@ def function_differences(lp: StabilizationLP, result: Result) -> list[str]:
     return reasons
 
 
-def _costs(lp: StabilizationLP) -> NDArray[np.float64]:
+def _costs(lp: StabilizationLP) -> Floats:
     """Return the mean stage cost of every pair, computed from the problem."""
     sampler = Sampler(lp.problem, lp.partition)
     table = np.empty((lp.n, len(lp.controls)))
@@ -254,5 +252,5 @@ def _costs(lp: StabilizationLP) -> NDArray[np.float64]:
         part = mean.T if block.cells_last else mean
         rows = slice(block.first, block.first + len(block.cells))
         table[rows, slice(*block.controls)] = part
-    cost: NDArray[np.float64] = table[lp.cell, lp.control]
+    cost: Floats = table[lp.cell, lp.control]
     return cost

@@ -3,11 +3,9 @@
 Beside them stand ``save`` and ``files``, which hold the files of a save together (reading.py).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields
-from typing import Annotated, Any, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, Self, TypeVar, get_type_hints
 
 from pydantic import BeforeValidator, ConfigDict, Field, create_model
 
@@ -86,10 +84,10 @@ class CertificateFile(_Keys):
     scope: str = SCOPE
 
     @classmethod
-    def read(cls, data: dict[str, Any]) -> CertificateFile:
+    def read(cls, data: dict[str, Any]) -> Self:
         """Check that every key has its type."""
         try:
-            found: CertificateFile = cls.model_validate(data)
+            found: Self = cls.model_validate(data)
         except BadInput as error:
             raise BadInput(error.message, joined(COMMIT, error.where)) from None
         return found

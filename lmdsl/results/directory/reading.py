@@ -6,8 +6,6 @@ that from this moment a reader finds the new files, also those that are not rena
 the old ones. Files of two saves are refused, or read again while another save is at work.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -35,7 +33,7 @@ class Mixture(BadInput):
     """The files of a directory are not of one save."""
 
 
-def read(folder: Path, what: Callable[[Reading], T]) -> T:
+def read(folder: Path, what: Callable[["Reading"], T]) -> T:
     """Read the files of one save, again where another save replaced them meanwhile.
 
     Raises

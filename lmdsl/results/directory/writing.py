@@ -6,8 +6,6 @@ directory are never touched. A directory that is not there yet is
 made beside its place, under a hidden name, and renamed.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import hashlib

@@ -1,7 +1,5 @@
 """Files for readers that are not lmdsl: a certificate to be checked alone, and Storm's format."""
 
-from __future__ import annotations
-
 from lmdsl.results.exports.certificate import export_certificate
 from lmdsl.results.exports.drn import export_drn
 

@@ -4,8 +4,6 @@ One JSON value per line: a head, a line per cell of C, a line per surviving pair
 doubles in hexadecimal, transitions as integers over the total of the head. See docs/exports.md.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ State i < n is the i-th cell of C, state n the attractor. The value of a state i
 ``cost`` until ``attractor`` is reached: ``R{"cost"}min=? [F "attractor"]``.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from fractions import Fraction

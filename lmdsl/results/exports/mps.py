@@ -1,7 +1,5 @@
 """The linear program in free MPS format, which every solver reads."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
