@@ -79,7 +79,7 @@ def check_measure(lp: StabilizationLP, policy: Pairs, mu: Floats) -> tuple[float
 
 
 def allowed_residual(mu: list[Fraction]) -> Fraction:
-    """Return the largest residual of claim 4 for a measure, exactly."""
+    """Return the largest residual of claim 4 for mu, exactly."""
     return Fraction(MEASURE_TOLERANCE) * max(Fraction(1), sum(mu, Fraction(0)))
 
 

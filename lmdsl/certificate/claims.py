@@ -84,9 +84,11 @@ class Witness:
     policy
         The policy: a column per cell; None where nothing is claimed of one.
     w
-        Vector of claim 1, or of the refusal; None where there is none.
+        Vector of claim 1; None where not established.
     V_up, W, mu
         Vectors of claims 2 to 4; None where not established (W then counts as 0).
+    refusal
+        Vector of the refusal; None where nothing is refused.
     """
 
     policy: Pairs | None
@@ -94,6 +96,7 @@ class Witness:
     V_up: Floats | None = None
     W: Floats | None = None
     mu: Floats | None = None
+    refusal: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)

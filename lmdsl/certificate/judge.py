@@ -122,7 +122,7 @@ MEASURE = Claim(
     "measure_residual",
 )  # fmt: skip
 REFUSAL = Claim(
-    "refusal", About.NO_POLICY, "w", _refusal, exact_checks.refusal,
+    "refusal", About.NO_POLICY, "refusal", _refusal, exact_checks.refusal,
     lambda lp, *_: f"proved: no policy has finite cost at gamma = {lp.gamma!r}",
 )  # fmt: skip
 CLAIMS = (STABILIZING, UPPER_BOUND, LOWER_BOUND, MEASURE, REFUSAL)

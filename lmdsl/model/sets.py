@@ -60,7 +60,7 @@ class CellSets:
     def of(
         cls, problem: Problem, partition: Partition, deadline: Deadline | None = None
     ) -> CellSets:
-        """Resolve the attractor, avoid and measure of a problem.
+        """Resolve the attractor, the avoid set and the weight of a problem.
 
         Raises
         ------
@@ -94,17 +94,17 @@ class CellSets:
 
 def _mass(problem: Problem, partition: Partition, guard: Guard) -> Floats:
     mass = np.ones(partition.size)
-    measure = problem.measure
-    if measure is None:
+    declared = problem.measure
+    if declared is None:
         return mass
     density = problem.density()
-    if measure.weights is not None:
-        if len(measure.weights) != partition.size:
+    if declared.weights is not None:
+        if len(declared.weights) != partition.size:
             raise BadInput(
-                f"{len(measure.weights)} weights for {partition.size} cells; give one each",
+                f"{len(declared.weights)} weights for {partition.size} cells; give one each",
                 "measure.weights",
             )
-        mass = np.array(measure.weights)
+        mass = np.array(declared.weights)
     elif density is not None:
         program = Program([density], problem.system.constants())
         for start in range(0, partition.size, PART):
@@ -119,9 +119,9 @@ def _mass(problem: Problem, partition: Partition, guard: Guard) -> Floats:
                 "and >= 0",
                 "measure.density",
             )
-    if measure.boxes is not None:
+    if declared.boxes is not None:
         boxes = (
-            partition.inside_box(box, f"measure.boxes[{i}]") for i, box in enumerate(measure.boxes)
+            partition.inside_box(box, f"measure.boxes[{i}]") for i, box in enumerate(declared.boxes)
         )
         inside = partition.mask(boxes, guard)
         if not inside.any():

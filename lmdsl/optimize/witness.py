@@ -88,14 +88,14 @@ def _first_try(
             policy, w, upper_vector(under, own, V, w, d), _guessed(under, V, tolerance)
         ), V
 
-    def measure() -> Floats | None:
+    def lyapunov_measure() -> Floats | None:
         return _measure_vector(under, rows, time_up)
 
-    if value is not None:  # then the measure is finite too
-        (witness, V), mu = threads.both(bounds_of_cost, measure, lp.n >= MANY)
+    if value is not None:  # then the Lyapunov measure is finite too
+        (witness, V), mu = threads.both(bounds_of_cost, lyapunov_measure, lp.n >= MANY)
     else:
         witness, V = bounds_of_cost()
-        mu = None if V is None else measure()
+        mu = None if V is None else lyapunov_measure()
     return replace(witness, mu=mu), V
 
 

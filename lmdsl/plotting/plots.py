@@ -315,5 +315,5 @@ def _codes(result: Result) -> Statuses:
     if result.status == Status.NOT_STABILIZABLE:
         code[free] = layers.UNSOLVED
         if result.cause == Cause.GAMMA:
-            code[free & (result.witness > 0)] = layers.INFINITE
+            code[free & (result.refusal_vector > 0)] = layers.INFINITE
     return code

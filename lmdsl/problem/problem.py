@@ -137,7 +137,7 @@ class Problem(Declared):
             raise BadInput(error.message, "stage_cost") from None
 
     def density(self) -> Formula | None:
-        """Return the parsed density of the measure, None where there is none."""
+        """Return the parsed density of the weight m, None where there is none."""
         if self.measure is None or self.measure.density is None:
             return None
         try:

@@ -143,6 +143,7 @@ class _Job:
             known = np.full(n, missing) if values is None else values
             return lp.expand(np.asarray(known, dtype=np.float64), attractor, outside)
 
+        w = witness.w if witness.refusal is None else witness.refusal
         index = np.full(lp.partition.size, -1, dtype=np.int32)
         if witness.policy is not None:
             index[lp.cells] = lp.control[witness.policy]
@@ -174,7 +175,7 @@ class _Job:
             lower=spread(witness.W if proof.lower_bound else None, 0.0, 0.0, np.inf),
             measure=spread(witness.mu, 0.0, 0.0, 0.0),
             cell_status=lp.cell_status,
-            witness=spread(witness.w, 0.0, 0.0, 0.0),
+            witness=spread(w, 0.0, 0.0, 0.0),
             control_vectors=lp.controls,
             lp=lp,
             **more,

@@ -15,7 +15,7 @@ from lmdsl.certificate.claims import Certificate
 from lmdsl.common import inputs
 from lmdsl.common.frozen import freeze
 from lmdsl.common.json_values import jsonable
-from lmdsl.common.types import Floats, Statuses
+from lmdsl.common.types import Bools, Floats, Statuses
 from lmdsl.control.controller import Controller
 from lmdsl.control.simulation import ClosedLoop, Simulation, simulate
 from lmdsl.errors import BadInput, shown
@@ -28,7 +28,7 @@ from lmdsl.model.local.controller import LocalController
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
-from lmdsl.results.status import Cause
+from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Coverage, Summary
 from lmdsl.systems.named import NotStored
 
@@ -85,7 +85,7 @@ class Result(Summary):
         Shape (N,), uint8: 0 attractor, 1 stabilized, 2 escapes, 3 trapped, 4 leads to these, 5
         avoid.
     witness
-        Shape (N,): w of claim 1, or of the refusal when not stabilizable; 0 elsewhere.
+        Shape (N,): ``stability_vector`` and ``refusal_vector``, as they are saved.
     control_vectors
         Shape (M, p).
     iterations
@@ -144,12 +144,27 @@ class Result(Summary):
         """The true map under the controller."""
         return ClosedLoop(self.problem, self.controller, self.cell_status)
 
+    @property
+    def stability_vector(self) -> Floats:
+        """The vector w of claim 1, shape (N,): 0 where there is none."""
+        return np.where(self._refused, 0.0, self.witness)
+
+    @property
+    def refusal_vector(self) -> Floats:
+        """The vector that proves gamma infeasible, shape (N,): 0 where it is not proved."""
+        return np.where(self._refused, self.witness, 0.0)
+
+    @property
+    def _refused(self) -> Bools:
+        beyond: Bools = self.cell_status == CellStatus.BEYOND_GAMMA
+        return beyond | np.bool_(self.status == Status.NOT_STABILIZABLE)
+
     @cached_property
     def beyond_gamma(self) -> Area | None:
         """The cells proved infeasible at this gamma, by region; None where none is."""
         mask = self.cell_status == CellStatus.BEYOND_GAMMA
         if self.cause == Cause.GAMMA:
-            mask = mask | (self.witness > 0)
+            mask = mask | (self.refusal_vector > 0)
         return Area.of(self.partition, np.flatnonzero(mask)) if mask.any() else None
 
     @cached_property

@@ -153,7 +153,7 @@ def _infeasible(
 ) -> Result | None:
     """Return the refusal of gamma, or the answer on the other cells; None if it is not proved."""
     verified = _refuse(lp, first, wishes.tolerance)
-    w = verified.witness.w
+    w = verified.witness.refusal
     if not verified.certificate.refusal or w is None:
         return None
     smaller = restriction.restricted(lp, w) if wishes.restrict_to_gamma else None
@@ -229,5 +229,5 @@ def _refuse(lp: StabilizationLP, found: first_policy.Refused, tolerance: float) 
     from lmdsl.optimize.descent import lower_until_below
 
     w = lower_until_below(lp, found.w, lp.gamma, None)
-    witness = Witness(None, found.w if w is None else w)
+    witness = Witness(None, refusal=found.w if w is None else w)
     return Verified(judge.verdict(lp, witness, tolerance), witness)

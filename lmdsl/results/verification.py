@@ -169,8 +169,8 @@ def _restricted(
     beyond = result.cell_status[lp.cells] == CellStatus.BEYOND_GAMMA
     if not beyond.any():
         return lp
-    w = np.where(beyond, result.witness[lp.cells], 0.0)
-    if not (w[beyond] > 0).all() or not judge(lp, Witness(None, w), 0.0).refusal:
+    w = np.where(beyond, result.refusal_vector[lp.cells], 0.0)
+    if not (w[beyond] > 0).all() or not judge(lp, Witness(None, refusal=w), 0.0).refusal:
         reasons.append("that gamma is infeasible from the cells left out is not proved")
     return restricted(lp, w) or lp
 
@@ -195,7 +195,7 @@ def _judge_claims(
         reasons.append("control_index is no policy on the stabilizable set")
     on = lp.cells
     V_up, W = result.value[on], result.lower[on]
-    witness = Witness(policy, result.witness[on], V_up, W, result.measure[on])
+    witness = Witness(policy, result.stability_vector[on], V_up, W, result.measure[on])
     certificate = judge(lp, witness, result.tolerance or 0.0)
     reasons += certificate.reasons
     return certificate
@@ -204,7 +204,7 @@ def _judge_claims(
 def _judge_refusal(
     lp: StabilizationLP, result: Result, reasons: list[str], judge: Judge
 ) -> Certificate:
-    witness = Witness(None, result.witness[lp.cells])
+    witness = Witness(None, refusal=result.refusal_vector[lp.cells])
     certificate = judge(lp, witness, result.tolerance or 0.0)
     proved = {
         Cause.EMPTY: not lp.n,

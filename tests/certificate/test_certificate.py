@@ -166,17 +166,17 @@ def test_shares_that_round_below_one_prove_nothing():
 
 def test_refusal_needs_a_true_vector():
     lp = lm.compile(made(doubling(2.0)))
-    assert verdict(lp, Witness(None, np.ones(1)), 1e-6).refusal
+    assert verdict(lp, Witness(None, refusal=np.ones(1)), 1e-6).refusal
     lower = lm.compile(made(doubling(np.nextafter(2.0, 0))))
-    assert not verdict(lower, Witness(None, np.ones(1)), 1e-6).refusal
-    assert not verdict(lp, Witness(None, np.zeros(1)), 1e-6).refusal
-    assert not verdict(lp, Witness(None, -np.ones(1)), 1e-6).refusal
-    assert not verdict(lp, Witness(None, np.full(1, np.nan)), 1e-6).refusal
+    assert not verdict(lower, Witness(None, refusal=np.ones(1)), 1e-6).refusal
+    assert not verdict(lp, Witness(None, refusal=np.zeros(1)), 1e-6).refusal
+    assert not verdict(lp, Witness(None, refusal=-np.ones(1)), 1e-6).refusal
+    assert not verdict(lp, Witness(None, refusal=np.full(1, np.nan)), 1e-6).refusal
 
 
 def test_a_refusal_is_never_a_verification():
     lp = lm.compile(made(doubling(3.0)))
-    assert not verdict(lp, Witness(None, np.ones(1)), 1e-6).verified
+    assert not verdict(lp, Witness(None, refusal=np.ones(1)), 1e-6).verified
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
@@ -254,4 +254,4 @@ def test_vectors_of_another_length_prove_nothing():
     for short in (np.ones(0), np.ones(1), np.ones(lp.n - 1), np.ones(lp.n + 1), np.ones((lp.n, 1))):
         proof = verdict(lp, Witness(pair, short, short, short, short), 1e-6)
         assert not any(getattr(proof, name) for name in CLAIMS)
-        assert not verdict(lp, Witness(None, short), 1e-6).refusal
+        assert not verdict(lp, Witness(None, refusal=short), 1e-6).refusal

@@ -162,8 +162,8 @@ def test_a_refusal_that_rounds_to_infinity_proves_nothing():
     lp = replace(lp.part(columns, np.arange(lp.n)), gamma=0.9)
     for w in (np.full(lp.n, LARGEST), np.full(lp.n, 1.79e308), np.ones(lp.n)):
         for judge_by in (verdict, exact_verdict):
-            assert not judge_by(lp, Witness(None, w), 1e-6).refusal
-            assert judge_by(replace(lp, gamma=1.0), Witness(None, w), 1e-6).refusal
+            assert not judge_by(lp, Witness(None, refusal=w), 1e-6).refusal
+            assert judge_by(replace(lp, gamma=1.0), Witness(None, refusal=w), 1e-6).refusal
 
 
 def test_the_smallest_cost_is_not_reported_as_nothing():

@@ -68,7 +68,7 @@ def drawn_witness(rng, model):
 
     if rng.random() < 0.25:
         w = settled(rng, model, numbers(rng, n), min, all_pairs(False))
-        return choice, Witness(None, w, W=numbers(rng, n))
+        return choice, Witness(None, W=numbers(rng, n), refusal=w)
     w = settled(
         rng, model, numbers(rng, n, 0.0), lambda a, b: max(a, math.nextafter(b, LARGEST)),
         lambda i, x: model.backup(i, choice[i], x, g, False),
@@ -114,12 +114,12 @@ def told(model, choice, witness, proof):
         "tolerance": TOLERANCE.hex(),
         **{k: None if v is None else float(v).hex() for k, v in stated.items()},
     }
-    names = ("w",) if refusal else ("w", "V_up", "W", "mu")
+    names = {"w": "refusal"} if refusal else {name: name for name in ("w", "V_up", "W", "mu")}
     cells = [
         {
             "policy": choice[i],
             "m": float(lp.weight[i]).hex(),
-            **{name: float(getattr(witness, name)[i]).hex() for name in names},
+            **{key: float(getattr(witness, name)[i]).hex() for key, name in names.items()},
         }
         for i in range(lp.n)
     ]
@@ -149,7 +149,7 @@ def judge(rng):
     fast, exact = verdict(lp, witness, TOLERANCE), exact_verdict(lp, witness, TOLERANCE)
     alone = told(model, choice, witness, exact)
     if witness.policy is None:
-        w = witness.w.tolist()
+        w = witness.refusal.tolist()
         truth = any(w) and all(
             Fraction(w[i]) <= model.backup(i, k, w, model.gamma, False)
             for i in range(model.n)

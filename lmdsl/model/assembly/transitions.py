@@ -150,8 +150,8 @@ def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
     calls = 2 + 2 * lanes * min(samples, CHUNK) // CHUNK
     work = lanes * samples * (SAMPLE + step.work + cost.work)
     work += CALL * calls * (step.effort + cost.effort)
-    attractor, avoid, measure = problem.attractor, problem.avoid, problem.measure
-    boxes = [attractor.boxes, avoid.boxes if avoid else (), (measure and measure.boxes) or ()]
+    attractor, avoid, weight = problem.attractor, problem.avoid, problem.measure
+    boxes = [attractor.boxes, avoid.boxes if avoid else (), (weight and weight.boxes) or ()]
     count = sum(map(len, boxes))
     work += N * count + SET * (count + len(attractor.points) + len(attractor.cells))
     density = problem.density()

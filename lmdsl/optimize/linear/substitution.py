@@ -6,7 +6,7 @@ level (Kahn's algorithm). No cell leads to another of its level, so a large leve
 several threads; its cells ascend, which keeps memory close. What is left, the core, holds every
 cycle (staying put is no cycle here) and all that cycles lead to; nothing in it depends on the cells
 taken away. So x = b + M x is solved on the core, then the others follow in the reverse order, each
-from cells already known. The transposed system, which a measure satisfies, goes the other way: mass
+from cells already known. The transposed system, which mu satisfies, goes the other way: mass
 flows down to the core, which is solved last.
 """
 

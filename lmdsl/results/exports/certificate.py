@@ -23,7 +23,7 @@ from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 
 FORMAT = "lmdsl-certificate/1"
-VECTORS = {"V_up": "value", "W": "lower", "w": "witness", "mu": "measure"}
+VECTORS = {"V_up": "value", "W": "lower", "w": "stability_vector", "mu": "measure"}
 
 
 @own_arithmetic
@@ -77,7 +77,7 @@ def _part(lp: StabilizationLP, result: Result) -> StabilizationLP:
     beyond = result.cell_status[lp.cells] == CellStatus.BEYOND_GAMMA
     if not beyond.any():
         return lp
-    return restricted(lp, np.where(beyond, result.witness[lp.cells], 0.0)) or lp
+    return restricted(lp, np.where(beyond, result.refusal_vector[lp.cells], 0.0)) or lp
 
 
 def _head(result: Result, lp: StabilizationLP, refused: bool) -> dict[str, Any]:
@@ -102,12 +102,13 @@ def _lines(
     head: dict[str, Any], result: Result, lp: StabilizationLP, refused: bool
 ) -> Iterator[bytes]:
     yield _line(head)
-    vectors = {"w": "witness"} if refused else VECTORS
+    names = {"w": "refusal_vector"} if refused else VECTORS
+    vectors = {key: getattr(result, name) for key, name in names.items()}
     for i, cell in enumerate(lp.cells):
         entry: dict[str, Any] = {"cell": int(cell)}
         if not refused:
             entry |= {"policy": int(result.control_index[cell]), "m": float(lp.weight[i]).hex()}
-        entry |= {key: float(getattr(result, name)[cell]).hex() for key, name in vectors.items()}
+        entry |= {key: float(vector[cell]).hex() for key, vector in vectors.items()}
         yield _line(entry)
     owner = np.repeat(np.arange(lp.n), np.diff(lp.pair_pointer))
     for k in range(lp.K):
