@@ -35,7 +35,7 @@ def expected_above(lp: StabilizationLP, policy: Pairs, x: Floats, gamma: float) 
     above = _above if tame(lp, x, gamma) else _carefully_above
 
     def part(cells: tuple[int, int]) -> None:
-        above(*cells, policy.view(np.uint64), *lp.rows.kernel, gamma, V, upper)
+        above(*cells, policy.view(np.uint64), lp.rows.kernel, gamma, V, upper)
 
     over_cells(lp, part)
     return upper
@@ -49,7 +49,7 @@ def inflow(
     The relative error also covers two more operations with the sum. Each of shape (n,).
     """
     total, entries = np.zeros(lp.n + 1), np.zeros(lp.n + 1)
-    _inflow(policy.view(np.uint64), *lp.rows.kernel, gamma, mu, total, entries)
+    _inflow(policy.view(np.uint64), lp.rows.kernel, gamma, mu, total, entries)
     terms = entries[:-1] + 8
     absolute = (1 + gamma) * terms * LEAST * (1 + mu.max(initial=0.0))
     return total[:-1], terms * UNIT, absolute
@@ -150,12 +150,13 @@ def worst_excess(lp: StabilizationLP, V: Floats) -> tuple[float, bool]:
 
 
 @kernel
-def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def]
+def _product(k, rows, V):  # type: ignore[no-untyped-def]
     """The sum (P V)_k, its relative and its absolute rounding error.
 
     The absolute part covers shares and products below the normal range of doubles; it is 0 only
     where every term is 0.
     """
+    pointer, target, code, share = rows
     q, top = 0.0, 0.0
     for e in range(pointer[k], pointer[k + ONE]):
         v = V[target[e]]
@@ -168,9 +169,9 @@ def _product(k, pointer, target, code, share, V):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _careful(k, pointer, target, code, share, gamma, g, V):  # type: ignore[no-untyped-def]
+def _careful(k, rows, gamma, g, V):  # type: ignore[no-untyped-def]
     """A lower bound of gamma (P V)_k + g that minds underflow."""
-    q, relative, absolute = _product(k, pointer, target, code, share, V)
+    q, relative, absolute = _product(k, rows, V)
     if absolute == 0.0:
         return g
     future = q * (1.0 - relative) - absolute
@@ -191,7 +192,8 @@ def _plain(entries, q, gamma, g):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _inflow(policy, pointer, target, code, share, gamma, mu, total, entries):  # type: ignore[no-untyped-def]
+def _inflow(policy, rows, gamma, mu, total, entries):  # type: ignore[no-untyped-def]
+    pointer, target, code, share = rows
     for i in range(np.uint64(len(policy))):
         k = policy[i]
         for e in range(pointer[k], pointer[k + ONE]):
@@ -200,7 +202,8 @@ def _inflow(policy, pointer, target, code, share, gamma, mu, total, entries):  #
 
 
 @kernel
-def _above(first, last, policy, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
+def _above(first, last, policy, rows, gamma, V, upper):  # type: ignore[no-untyped-def]
+    pointer, target, code, share = rows
     for i in range(np.uint64(first), np.uint64(last)):
         k = policy[i]
         q = 0.0
@@ -211,18 +214,17 @@ def _above(first, last, policy, pointer, target, code, share, gamma, V, upper): 
 
 
 @kernel
-def _carefully_above(first, last, policy, pointer, target, code, share, gamma, V, upper):  # type: ignore[no-untyped-def]
+def _carefully_above(first, last, policy, rows, gamma, V, upper):  # type: ignore[no-untyped-def]
     for i in range(np.uint64(first), np.uint64(last)):
-        q, relative, absolute = _product(policy[i], pointer, target, code, share, V)
+        q, relative, absolute = _product(policy[i], rows, V)
         future = gamma * (q * (1.0 + relative) + absolute)
         upper[i] = 0.0 if absolute == 0.0 else future * (1.0 + 4.0 * UNIT) + 2.0 * LEAST
 
 
 @kernel
-def _open(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, found
-):
+def _open(first, last, pair_pointer, rows, gamma, cost, V, found):  # type: ignore[no-untyped-def]
     """Find pairs whose bound is below V, the largest excess / cost, and if a cost of 0 has one."""
+    pointer, target, code, share = rows
     count, worst, stuck = 0, 0.0, False
     for i in range(np.uint64(first), np.uint64(last)):
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
@@ -248,16 +250,14 @@ def _open(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _carefully(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, lower, found
-):
+def _carefully(first, last, pair_pointer, rows, gamma, cost, V, lower, found):  # type: ignore[no-untyped-def]
     """All that :func:`_below` and :func:`_open` find out, minding underflow."""
     count, worst, stuck = 0, 0.0, False
     for i in range(np.uint64(first), np.uint64(last)):
         best = np.inf
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             g = cost[k] if len(cost) else 0.0
-            below = _careful(k, pointer, target, code, share, gamma, g, V)
+            below = _careful(k, rows, gamma, g, V)
             best = below if below < best else best
             excess = V[i] - below
             if excess > 0.0:

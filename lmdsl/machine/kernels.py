@@ -194,10 +194,17 @@ class Cache:
 
     def _entry(self, signature: Any, target: Any) -> tuple[str, bytes]:
         """Return the name of a file, and the key that it begins with."""
-        machine = repr((str(signature), target.codegen().magic_tuple())).encode()
+        fields = [*map(_fields, signature)]  # their order: the types say only what they hold
+        machine = repr((str(signature), fields, target.codegen().magic_tuple())).encode()
         short = hashlib.sha256(machine).hexdigest()[:12]
         name = f"{self.name}.{sys.implementation.cache_tag}-{short}.kernel"
         return name, hashlib.sha256(machine + self.stamp).digest()
+
+
+def _fields(kind: Any) -> Any:
+    """Return the names of the fields of a type of named tuples, and of those within."""
+    names = getattr(kind, "fields", None)
+    return names and [(name, _fields(inner)) for name, inner in zip(names, kind, strict=True)]
 
 
 @cache

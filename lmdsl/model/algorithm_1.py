@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +42,15 @@ class Predecessors:
         pair = np.empty(len(rows.target), dtype=np.int32 if small else np.int64)
         _transpose(rows.pointer, rows.target, pointer, pair)
         return cls(pointer, pair)
+
+
+class Graph(NamedTuple):
+    """The pairs of every cell, their rows, and which may be used, as compiled loops read them."""
+
+    pair_pointer: NDArray[np.uint64]
+    pointer: NDArray[np.uint64]
+    target: NDArray[np.uint32]
+    alive: Bools
 
 
 def tree(
@@ -94,11 +103,13 @@ def _tree(
     left = 0 if before else PATIENCE * len(rows.target)
     below = 0
 
-    model = [fixed(a) for a in (pair_pointer.view(np.uint64), *rows.kernel[:2], alive, front)]
-    all_alive = bool(alive.all())
+    pointer, target, _, _ = rows.kernel
+    pairs = fixed(pair_pointer.view(np.uint64))
+    model = Graph(pairs, fixed(pointer), fixed(target), fixed(alive))
+    all_alive, front_now = bool(alive.all()), fixed(front)
 
     def sweep(span: tuple[int, int]) -> int:
-        return int(_sweep(*model, all_alive, below, level, pair, *span))
+        return int(_sweep(*span, model, all_alive, front_now, below, level, pair))
 
     while left > 0 and front.any():
         left -= sum(threads.each(sweep, spans))
@@ -131,11 +142,12 @@ def _transpose(pointer, target, out_pointer, pair):  # type: ignore[no-untyped-d
 
 
 @kernel
-def _sweep(pair_pointer, pointer, target, alive, front, all_alive, below, level, pair, first, last):  # type: ignore[no-untyped-def]
+def _sweep(first, last, model, all_alive, front, below, level, pair):  # type: ignore[no-untyped-def]
     """Put on level ``below + 1`` the cells first..last-1 without level that can enter the front.
 
     Returns the number of entries visited. ``front`` is the cells on level ``below``.
     """
+    pair_pointer, pointer, target, alive = model
     visits = np.uint64(0)
     for i in range(np.uint64(first), np.uint64(last)):
         if level[i] >= 0:
@@ -186,16 +198,16 @@ def reaches_attractor(lp: StabilizationLP, policy: Pairs) -> Bools:
     """Return the cells from which the policy can reach A, shape (n,)."""
     reaches = np.zeros(lp.n + 1, dtype=np.bool_)
     reaches[-1] = True
-    if not _reach(policy.view(np.uint64), *lp.rows.kernel[:2], reaches, 64):
+    if not _reach(policy.view(np.uint64), lp.rows.kernel, reaches, 64):
         level, _ = tree(np.arange(lp.n + 1, dtype=np.int64), lp.rows.take(policy))
         return level >= 0
     return reaches[:-1]
 
 
 @kernel
-def _reach(policy, pointer, target, reaches, sweeps):  # type: ignore[no-untyped-def]
+def _reach(policy, rows, reaches, sweeps):  # type: ignore[no-untyped-def]
     """Mark cells with a marked successor until nothing changes; False where sweeps run out."""
-    n = np.uint64(len(policy))
+    pointer, target, n = rows.pointer, rows.target, np.uint64(len(policy))
     for sweep in range(sweeps):
         changed = False
         for t in range(n):

@@ -29,7 +29,7 @@ from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
-from lmdsl.model.rows import Rows
+from lmdsl.model.rows import RowArrays, Rows
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
@@ -208,9 +208,9 @@ class StabilizationLP(Frozen):
         return self._levels or algorithm_1.tree(self.pair_pointer, self.rows)
 
     @property
-    def _kernel(self) -> tuple[NDArray[Any], ...]:
+    def _kernel(self) -> tuple[NDArray[np.uint64], RowArrays]:
         """The pairs of every cell and their rows as compiled loops read them."""
-        return self.pair_pointer.view(np.uint64), *self.rows.kernel
+        return self.pair_pointer.view(np.uint64), self.rows.kernel
 
     @cached_property
     def _directions(self) -> Directions:

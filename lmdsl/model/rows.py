@@ -12,7 +12,7 @@ entry, 0 there. Every row sums to exactly 1 with it.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +69,18 @@ class Shares(Frozen):
         )
 
 
+class RowArrays(NamedTuple):
+    """Rows as compiled loops read them.
+
+    Unsigned indices spare Numba the test for negative ones, which costs as much as the sum.
+    """
+
+    pointer: NDArray[np.uint64]
+    target: NDArray[np.uint32]
+    code: NDArray[np.unsignedinteger]
+    share: NDArray[np.float64]
+
+
 @dataclass(frozen=True, eq=False)
 class Rows(Frozen):
     """Transition rows in compressed form.
@@ -99,13 +111,10 @@ class Rows(Frozen):
         return len(self.pointer) - 1
 
     @property
-    def kernel(self) -> tuple[NDArray[Any], ...]:
-        """Pointer, target, code and shares as compiled loops read them.
-
-        Unsigned indices spare Numba the test for negative ones, which costs as much as the sum.
-        """
+    def kernel(self) -> RowArrays:
+        """The rows as compiled loops read them."""
         pointer, target = self.pointer.view(np.uint64), self.target.view(np.uint32)
-        return pointer, target, self.code, self.shares.value
+        return RowArrays(pointer, target, self.code, self.shares.value)
 
     def exact(self, k: int) -> list[tuple[int, int]]:
         """Return row k as (target, numerator); the numerators sum to ``shares.total``."""
@@ -122,10 +131,10 @@ class Rows(Frozen):
         parts = spans(len(chosen))
 
         def lengths(span: tuple[int, int]) -> None:
-            _lengths(*span, chosen, self.kernel[0], pointer[1:])
+            _lengths(*span, chosen, self.kernel.pointer, pointer[1:])
 
         def copy(span: tuple[int, int]) -> None:
-            _take(*span, chosen, *self.kernel[:3], pointer, target, code)
+            _take(*span, chosen, self.kernel, pointer, target, code)
 
         threads.each(lengths, parts)
         np.cumsum(pointer, out=pointer)
@@ -149,9 +158,8 @@ class Rows(Frozen):
         indptr = np.empty(len(chosen) + 1, dtype=np.int32 if small else np.int64)
         indices = np.empty(int(pointer[-1]), dtype=indptr.dtype)
         data = np.empty(int(pointer[-1]))
-        used = _gather(
-            chosen.view(np.uint64), *self.kernel, np.uint32(self.columns), indptr, indices, data
-        )  # fmt: skip
+        columns = np.uint32(self.columns)
+        used = _gather(chosen.view(np.uint64), self.kernel, columns, indptr, indices, data)
         matrix = csr_array((data[:used], indices[:used], indptr), shape=(len(chosen), self.columns))
         if not self.shares.merged:
             matrix.sum_duplicates()
@@ -164,27 +172,29 @@ def spans(count: int) -> list[tuple[int, int]]:
 
 
 @kernel
-def _take(first, last, rows, pointer, target, code, out_pointer, out_target, out_code):  # type: ignore[no-untyped-def]
+def _take(first, last, chosen, rows, out_pointer, out_target, out_code):  # type: ignore[no-untyped-def]
+    pointer, target, code = rows.pointer, rows.target, rows.code
     for r in range(np.uint64(first), np.uint64(last)):
-        shift = np.uint64(out_pointer[r]) - pointer[rows[r]]
-        for e in range(pointer[rows[r]], pointer[rows[r] + ONE]):
+        shift = np.uint64(out_pointer[r]) - pointer[chosen[r]]
+        for e in range(pointer[chosen[r]], pointer[chosen[r] + ONE]):
             out_target[e + shift] = target[e]
             out_code[e + shift] = code[e]
 
 
 @kernel
-def _lengths(first, last, rows, pointer, length):  # type: ignore[no-untyped-def]
+def _lengths(first, last, chosen, pointer, length):  # type: ignore[no-untyped-def]
     for r in range(np.uint64(first), np.uint64(last)):
-        length[r] = pointer[rows[r] + ONE] - pointer[rows[r]]
+        length[r] = pointer[chosen[r] + ONE] - pointer[chosen[r]]
 
 
 @kernel
-def _gather(rows, pointer, target, code, share, columns, indptr, indices, data):  # type: ignore[no-untyped-def]
+def _gather(chosen, rows, columns, indptr, indices, data):  # type: ignore[no-untyped-def]
     """Copy rows without the attractor's share into the arrays of a CSR matrix."""
+    pointer, target, code, share = rows
     used = np.uint64(0)
     indptr[0] = 0
-    for r in range(np.uint64(len(rows))):
-        k = rows[r]
+    for r in range(np.uint64(len(chosen))):
+        k = chosen[r]
         for e in range(pointer[k], pointer[k + ONE]):
             if target[e] < columns:
                 indices[used] = target[e]

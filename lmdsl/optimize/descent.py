@@ -92,9 +92,8 @@ def raise_from_zero(
 
 
 @kernel
-def _below(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, cost, V, lower
-):
+def _below(first, last, pair_pointer, rows, gamma, cost, V, lower):  # type: ignore[no-untyped-def]
+    pointer, target, code, share = rows
     for i in range(np.uint64(first), np.uint64(last)):
         best = np.inf
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):

@@ -9,6 +9,7 @@ import logging
 import os
 import subprocess
 import sys
+from collections import namedtuple
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,22 @@ def test_kernels_are_compiled_once_for_the_types_of_their_arguments(folder, said
     assert compiled(said) == 2
     assert len(list(folder.iterdir())) == 2
     assert not said(logging.WARNING)
+
+
+def test_named_tuples_are_told_apart_by_the_order_of_their_fields(folder, said):
+    """Numba's names of their types say only what they hold, and a kernel may name no place."""
+
+    def difference(pair):
+        return pair.a - pair.b
+
+    def outer(pair):
+        return pair.inner.a - pair.inner.b
+
+    for names, value in (("a b", 1.0), ("b a", -1.0)):
+        pair = namedtuple("Pair", names)(3.0, 2.0)
+        assert kernels.kernel(difference)(pair) == value
+        assert kernels.kernel(outer)(namedtuple("Outer", "inner")(pair)) == value
+    assert compiled(said) == 4
 
 
 @pytest.mark.parametrize("spoil", [

@@ -12,7 +12,7 @@ from problems import made, standard_map
 import lmdsl as lm
 from lmdsl.machine import threads
 from lmdsl.model.assembly import merging, sampler
-from lmdsl.model.assembly.merging import mean_cost, merge, tile
+from lmdsl.model.assembly.merging import BlockRows, Numbering, mean_cost, merge, tile
 from lmdsl.model.grid import axis
 from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.grid.partition import Partition
@@ -91,15 +91,20 @@ def test_rows_count_the_samples_of_each_target_and_group(samples, cells_last, gr
     mean = rng.random((cells, controls))
     laid = [index.transpose(1, 2, 0), mean.T] if cells_last else [index.transpose(0, 2, 1), mean]
     pairs = cells * controls
-    per_cell, control = np.zeros(cells, dtype=np.int64), np.empty(pairs, dtype=np.int32)
-    cost, end = np.empty(pairs), np.empty(pairs, dtype=np.int64)
-    target = np.empty(pairs * samples, dtype=np.int32)
-    code = np.empty(pairs * samples, dtype=np.uint32)
+    rows = BlockRows(
+        np.zeros(cells, dtype=np.int64),
+        np.empty(pairs, dtype=np.int32),
+        np.empty(pairs),
+        np.empty(pairs, dtype=np.int64),
+        np.empty(pairs * samples, dtype=np.int32),
+        np.empty(pairs * samples, dtype=np.uint32),
+    )
+    per_cell, control, cost, end, target, code = rows
     high, wide = tile(cells_last, controls)
     kept, entries = merge(
-        np.ascontiguousarray(laid[0]), cells_last, np.ascontiguousarray(laid[1]), number, group,
-        bits, first_code, np.empty((samples, high * wide), dtype=kind), high, wide,
-        per_cell, control, cost, end, target, code,
+        np.ascontiguousarray(laid[0]), cells_last, np.ascontiguousarray(laid[1]),
+        Numbering(number, group, bits, first_code), np.empty((samples, high * wide), dtype=kind),
+        high, wide, rows,
     )  # fmt: skip
     expected = []
     for c in range(cells):

@@ -161,9 +161,11 @@ def test_the_kernel_against_a_plain_reference():
         mean = np.zeros((shape[0], shape[3]))
         tape.append((lines.ABS, len(rows) - 1, len(rows) - 1, len(rows)))
         lines._run(
-            int(rng.choice([512, 7])), np.array(tape), np.array([0.7]), len(rows) + 1, 3,
-            *lines._Inputs.of(arrays), *shape, np.empty(0, dtype=np.int64), np.empty((0, 6)),
-            False, np.empty((0, 0, 0)), len(rows), weights, mean,
+            int(rng.choice([512, 7])),
+            lines.Tape(np.array(tape), np.array([0.7]), 3, len(rows) + 1),
+            lines._Inputs.of(arrays), shape,
+            lines.Located(np.empty(0, dtype=np.int64), np.empty((0, 6)), False),
+            np.empty((0, 0, 0)), len(rows), weights, mean,
         )  # fmt: skip
         with np.errstate(all="ignore"):
             expected = np.einsum("ipqj,q->ij", cost, weights) / (shape[1] * weights.sum())
@@ -173,9 +175,9 @@ def test_the_kernel_against_a_plain_reference():
 
 def test_rows_are_used_again_but_never_that_of_an_operand():
     text = "+".join(f"(x*u*{k}-x)/(u-{k + 2})" for k in range(30))
-    found = Lines.of(Program([parse(text, {"x", "u"})]), ["u"])
-    assert found.rows - found.tape[0, 3] <= 4 < len(found.tape) / 20
-    assert all(result not in (a, b) for _, a, b, result in found.tape.tolist())
+    tape = Lines.of(Program([parse(text, {"x", "u"})]), ["u"]).tape
+    assert tape.rows - tape.steps[0, 3] <= 4 < len(tape.steps) / 20
+    assert all(result not in (a, b) for _, a, b, result in tape.steps.tolist())
 
 
 @pytest.mark.parametrize("name", sorted(lm.systems.NAMED))

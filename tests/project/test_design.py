@@ -199,6 +199,16 @@ def test_no_file_is_too_long():
     assert not long
 
 
+def test_no_kernel_takes_too_many_arguments():
+    """Arrays that belong together come as a named tuple."""
+    for name, path in house.modules(PACKAGE).items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and any(
+                ast.unparse(each).startswith("kernel") for each in node.decorator_list
+            ):
+                assert len(node.args.args) <= 10, f"{name}.{node.name}"
+
+
 def test_no_test_file_is_too_long():
     lengths = {
         path.name: len(path.read_text().splitlines())

@@ -30,6 +30,33 @@ LEAST, MOST = 8, 1_000
 ADD, SUBTRACT, MULTIPLY, DIVIDE, NEGATIVE, ABS, SQRT, FLOOR, CEIL = range(len(PLAIN))
 
 
+class Tape(NamedTuple):
+    """What is done line by line.
+
+    Attributes
+    ----------
+    steps
+        Code, rows of both operands and row of the result of every instruction, shape (., 4).
+    constants
+        The values of the rows that follow those of the inputs.
+    inputs, rows
+        Number of rows that hold inputs, and of all.
+    """
+
+    steps: Indices
+    constants: Floats
+    inputs: int
+    rows: int
+
+
+class Located(NamedTuple):
+    """Rows to locate, shape (a,), the numbers of their axes, shape (a, 6), and whether to clip."""
+
+    rows: Indices
+    axes: Floats
+    clip: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Lines:
     """Formulas split into what NumPy evaluates and what is done line by line.
@@ -41,18 +68,12 @@ class Lines:
     varying
         For each output its row among the lines, -1 where it is small.
     tape
-        Code, rows of both operands and row of the result of every instruction, shape (., 4).
-    constants
-        The values of the rows that follow those of the inputs.
-    rows
-        Number of rows.
+        What is done line by line.
     """
 
     early: Program
     varying: tuple[int, ...]
-    tape: Indices
-    constants: Floats
-    rows: int
+    tape: Tape
 
     @classmethod
     def of(cls, program: Program, controls: Collection[str]) -> Self | None:
@@ -77,9 +98,12 @@ class Lines:
         return cls(
             program.part([*(k for k in program.outputs if k not in made), *inputs]),
             tuple(row[k] if k in made else -1 for k in program.outputs),
-            np.array(tape, dtype=np.int64),
-            np.array([program.template[k] for k in constants], dtype=np.float64),
-            rows,
+            Tape(
+                np.array(tape, dtype=np.int64),
+                np.array([program.template[k] for k in constants], dtype=np.float64),
+                len(inputs),
+                rows,
+            ),
         )
 
     def __call__(
@@ -119,19 +143,20 @@ class Lines:
                 part = axis.add_index(next(found), clip, None)
                 base = part if base is None else base + part
         axes = list(axes) if not all(small[: len(axes)]) else []
-        located = [(axis, row) for axis, row in zip(axes, self.varying, strict=False) if row >= 0]
+        large = [(axis, row) for axis, row in zip(axes, self.varying, strict=False) if row >= 0]
+        located = Located(
+            np.array([row for _, row in large], dtype=np.int64),
+            np.array([axis for axis, _ in large], dtype=np.float64).reshape(-1, 6),
+            clip,
+        )
         first, points, nodes, last = shape
-        index = np.empty((first if located else 0, points * nodes, last))
+        index = np.empty((first if large else 0, points * nodes, last))
         cost_at = self.varying[-1] if weights is not None else -1
         mean = np.zeros((first if cost_at >= 0 else 0, last))
         packed = _Inputs.of(inputs if base is None else [*inputs, base])
-        _run(
-            LINE, self.tape, self.constants, self.rows, len(inputs), *packed, *shape,
-            np.array([row for _, row in located], dtype=np.int64),
-            np.array([axis for axis, _ in located], dtype=np.float64).reshape(-1, 6),
-            clip, index, cost_at, np.ones(nodes) if weights is None else weights, mean,
-        )  # fmt: skip
-        return (index if located else None), (mean if cost_at >= 0 else None)
+        weights = np.ones(nodes) if weights is None else weights
+        _run(LINE, self.tape, packed, shape, located, index, cost_at, weights, mean)
+        return (index if large else None), (mean if cost_at >= 0 else None)
 
 
 class _Inputs(NamedTuple):
@@ -210,27 +235,21 @@ def _placed(
 
 
 @kernel(allocates=True)
-def _run(  # type: ignore[no-untyped-def]
-    long, tape, constants, rows, inputs, flat, start, stride, first, points, nodes, last,
-    located, axes, clip, index, cost_at, weights, mean,
-):  # fmt: skip
+def _run(long, tape, packed, shape, located, index, cost_at, weights, mean):  # type: ignore[no-untyped-def]
     """Fill ``index`` and ``mean``, those of length 0 apart; see :meth:`Lines.__call__`.
 
     Parameters
     ----------
     long
         Samples at a time.
-    tape, constants, rows, flat, start, stride
-        See :class:`Lines` and :class:`_Inputs`.
-    inputs
-        Number of rows that hold inputs; one more input is added to the indices of every sample.
-    first, points, nodes, last
-        The shape of the block.
-    located, axes
-        Rows to locate, and the numbers of their axes.
+    tape, packed, shape, located
+        :class:`Tape`, :class:`_Inputs`, the shape of the block, :class:`Located`. One more input
+        than the tape has is added to the indices of every sample.
     cost_at
         Row of the cost.
     """
+    (steps, constants, inputs, rows), (flat, start, stride) = tape, packed
+    first, points, nodes, last = shape
     work, least = np.empty((rows, long)), np.zeros(mean.shape)
     for c in range(len(constants)):
         work[inputs + c, :] = constants[c]
@@ -243,15 +262,15 @@ def _run(  # type: ignore[no-untyped-def]
                     if i == 0 or stride[k, 0] > 0:
                         at = start[k] + i * stride[k, 0] + p * stride[k, 1] + q * stride[k, 2]
                         _load(flat, at + j * stride[k, 3], stride[k, 3], work[k][:n])
-                _compute(tape, work, n)
+                _compute(steps, work, n)
                 if len(index):
                     line = index[i, s, j : j + n]
                     line[:] = 0.0
                     for k in range(inputs, len(start)):
                         at = start[k] + i * stride[k, 0] + p * stride[k, 1] + q * stride[k, 2]
                         _load(flat, at + j * stride[k, 3], stride[k, 3], line)
-                    for a in range(len(located)):
-                        _locate(work[located[a]][:n], axes[a], clip, line)
+                    for a in range(len(located.rows)):
+                        _locate(work[located.rows[a]][:n], located.axes[a], located.clip, line)
                 if len(mean):
                     add_cost(work[cost_at], weights[q], mean[i, j : j + n], least[i, j : j + n])
     total = points * weights.sum()

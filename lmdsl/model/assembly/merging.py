@@ -4,21 +4,59 @@ The samples of many pairs stand side by side, one lane per pair. So the steps th
 samples alike (sorting, summing the cost) run on vectors of pairs.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common.types import Floats
 from lmdsl.machine.kernels import ONE, kernel
 
 Array = NDArray[Any]
 
 
+class Numbering(NamedTuple):
+    """How cells and samples are numbered in the rows.
+
+    Attributes
+    ----------
+    target
+        Target of every cell, negative where it counts as leaving, shape (N,).
+    group, bits
+        Group of every sample, shape (S,), below ``2**bits``, of the type of keys.
+    first_code
+        Code of one sample of each group; n samples have ``first_code + n - 1``.
+    """
+
+    target: NDArray[np.int32]
+    group: Array
+    bits: int
+    first_code: NDArray[np.int64]
+
+
+class BlockRows(NamedTuple):
+    """The admissible pairs of a block, ordered by cell, then control.
+
+    Attributes
+    ----------
+    per_cell
+        Number of pairs of each cell.
+    control, cost, end
+        Per pair: control index, mean cost, end of its row.
+    target, code
+        The rows one after the other.
+    """
+
+    per_cell: NDArray[np.int64]
+    control: NDArray[np.int32]
+    cost: Floats
+    end: NDArray[np.int64]
+    target: NDArray[np.int32]
+    code: NDArray[np.uint32]
+
+
 @kernel
-def merge(  # type: ignore[no-untyped-def]
-    index, cells_last, mean, number, group, bits, first_code, key, high, wide,
-    per_cell, control, cost, end, target, code,
-):  # fmt: skip
+def merge(index, cells_last, mean, numbers, key, high, wide, rows):  # type: ignore[no-untyped-def]
     """Turn the image cells of every pair into a row: sorted (target, code), equal ones counted.
 
     Parameters
@@ -28,30 +66,25 @@ def merge(  # type: ignore[no-untyped-def]
         NaN where a sample leaves.
     mean
         Mean costs, the first and last axis of ``index``, each of its length or 1.
-    number
-        Target of every cell, negative where it counts as leaving, shape (N,).
-    group, bits
-        Group of every sample, shape (S,), below ``2**bits``.
-    first_code
-        Code of one sample of each group; n samples have ``first_code + n - 1``.
+    numbers
+        :class:`Numbering`.
     key
         Room for ``target << bits | group`` of the samples of a tile, an integer type wide enough
         for it, shape (S, high * wide).
     high, wide
         Cells and controls of a tile: :func:`tile`.
-    per_cell, control, cost, end, target, code
-        Results. Admissible pairs of each cell (zeros on entry); for each of them, ordered by cell,
-        then control, its control, mean cost and the end of its row; the rows one after the other.
+    rows
+        The result, :class:`BlockRows` with room enough, ``per_cell`` zeros on entry.
 
     Returns
     -------
     pairs, entries : int
         How many were written.
     """
+    per_cell, control, cost, end, target, code = rows
     pairs = entries = np.uint64(0)
     first, _, last = index.shape
-    rows, columns = mean.shape
-    down, right = np.uint64(rows > 1), np.uint64(columns > 1)
+    down, right = np.uint64(mean.shape[0] > 1), np.uint64(mean.shape[1] > 1)
     cells = len(per_cell)
     controls = first * last // cells
     for c0 in range(0, cells, high):
@@ -63,14 +96,14 @@ def merge(  # type: ignore[no-untyped-def]
                 index, np.uint64(a0 if cells_last else c0), np.uint64(a1 if cells_last else c1),
                 np.uint64(c0 if cells_last else a0), np.uint64(c1 if cells_last else a1),
                 np.uint64(1 if cells_last else across), np.uint64(across if cells_last else 1),
-                number, group, bits, key,
+                numbers, key,
             )  # fmt: skip
             _sort(key, np.uint64((c1 - c0) * (a1 - a0)))
             k = np.uint64(0)
             for c in range(c0, c1):
                 for a in range(a0, a1):
                     if key[0, k] >= 0:  # a sample that leaves has a negative key, now the first
-                        entries = _row(key, k, bits, first_code, entries, target, code)
+                        entries = _row(key, k, numbers, entries, target, code)
                         i, j = np.uint64(a if cells_last else c), np.uint64(c if cells_last else a)
                         cost[pairs] = mean[down * i, right * j]
                         control[pairs], end[pairs] = a, entries
@@ -80,14 +113,13 @@ def merge(  # type: ignore[no-untyped-def]
     return pairs, entries
 
 
-def merge_one(
-    index: Array, number: Array, group: Array, bits: int, first_code: Array
-) -> tuple[Array, Array]:
+def merge_one(index: Array, numbers: Numbering) -> tuple[Array, Array]:
     """Return the targets and codes of one pair of many samples, none where one leaves.
 
     The same as by :func:`merge`, sorted by NumPy: fewer comparisons, and no long call of native
-    code that nothing can end. Parameters as there, ``group`` of the type of keys.
+    code that nothing can end. Parameters as there.
     """
+    number, group, bits, first_code = numbers
     image = index.reshape(-1)
     inside = image >= 0.0
     if not inside.all():
@@ -114,12 +146,13 @@ def tile(cells_last: bool, controls: int) -> tuple[int, int]:
 
 
 @kernel
-def _keys(index, f0, f1, l0, l1, down, right, number, group, bits, key):  # type: ignore[no-untyped-def]
+def _keys(index, f0, f1, l0, l1, down, right, numbers, key):  # type: ignore[no-untyped-def]
     """Gather ``target << bits | group`` of every sample of a tile, columns by cell and control.
 
     A step along the first axis of ``index`` is ``down`` columns, along the last ``right``. All
     samples of a pair one after the other: they land near each other, in ``number`` too.
     """
+    number, group, bits, _ = numbers
     for f in range(f0, f1):
         for s in range(np.uint64(len(key))):
             column = (f - f0) * down
@@ -158,11 +191,12 @@ def _sort(key, count):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _row(key, k, bits, first_code, entries, target, code):  # type: ignore[no-untyped-def]
+def _row(key, k, numbers, entries, target, code):  # type: ignore[no-untyped-def]
     """Append one entry per distinct key of column k; return the new number of entries.
 
     Every sample overwrites the last entry or begins the next: no branch that depends on the keys.
     """
+    bits, first_code = numbers.bits, numbers.first_code
     mask = (1 << bits) - 1
     last = key[np.uint64(0), k]
     count = first_code[np.uint64(last & mask)]

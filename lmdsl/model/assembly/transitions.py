@@ -24,7 +24,7 @@ from lmdsl.formulas.program import Program
 from lmdsl.machine import memory, threads
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model import discretization
-from lmdsl.model.assembly.merging import merge, merge_one, tile
+from lmdsl.model.assembly.merging import BlockRows, Numbering, merge, merge_one, tile
 from lmdsl.model.assembly.sampler import CHUNK, Block, Sampler
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.rows import Rows, Shares, code_type
@@ -242,62 +242,43 @@ def outcome(sampler: Sampler, cell: int, control: int) -> NDArray[np.int64]:
     return np.where(index >= 0, index, -1.0).astype(np.int64)
 
 
-class _BlockRows(NamedTuple):
-    """The admissible pairs of a block, ordered by cell, then control.
-
-    Attributes
-    ----------
-    per_cell
-        Number of pairs of each cell.
-    control, cost, end
-        Per pair: control index, mean cost, end of its row.
-    target, code
-        The rows one after the other.
-    """
-
-    per_cell: NDArray[np.int64]
-    control: NDArray[np.int32]
-    cost: Floats
-    end: NDArray[np.int64]
-    target: NDArray[np.int32]
-    code: NDArray[np.uint32]
-
-
 class _Assembler:
     """Computes the rows of blocks; it may be called from several threads at once."""
 
     def __init__(self, sampler: Sampler, sets: CellSets) -> None:
-        self.sampler, self.number = sampler, sets.number
-        nodes = sampler.nodes
+        self.sampler, nodes = sampler, sampler.nodes
         sizes = np.bincount(nodes.group) * len(sampler.points)
-        self.first_code = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
-        self.bits = int(nodes.group.max()).bit_length()
-        wide = (len(sets.free) + 1) << self.bits > 2**31
-        self.key = np.int64 if wide else np.int32
-        self.group = np.tile(nodes.group, len(sampler.points)).astype(self.key)
+        first_code = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+        bits = int(nodes.group.max()).bit_length()
+        wide = (len(sets.free) + 1) << bits > 2**31
+        group = np.tile(nodes.group, len(sampler.points)).astype(np.int64 if wide else np.int32)
+        self.numbers = Numbering(sets.number, group, bits, first_code)
 
-    def __call__(self, block: Block) -> tuple[Block, _BlockRows]:
+    def __call__(self, block: Block) -> tuple[Block, BlockRows]:
         sampler, lanes = self.sampler, block.lanes
         index, mean = sampler.outcomes(block)
-        per_cell = np.zeros(len(block.cells), dtype=np.int64)
-        control, cost = np.empty(lanes, dtype=np.int32), np.empty(lanes)
-        end = np.empty(lanes, dtype=np.int64)
-        target = np.empty(index.size, dtype=np.int32)
-        code = np.empty(index.size, dtype=np.uint32)
+        rows = BlockRows(
+            np.zeros(len(block.cells), dtype=np.int64),
+            np.empty(lanes, dtype=np.int32),
+            np.empty(lanes),
+            np.empty(lanes, dtype=np.int64),
+            np.empty(index.size, dtype=np.int32),
+            np.empty(index.size, dtype=np.uint32),
+        )
+        per_cell, control, cost, end, target, code = rows
         high, wide = tile(block.cells_last, block.width)
         high = min(high, len(block.cells))
         if lanes == 1 and sampler.samples >= MANY:
             sampler.guard()
-            row = merge_one(index, self.number, self.group, self.bits, self.first_code)
+            row = merge_one(index, self.numbers)
             entries = len(row[0])
             target[:entries], code[:entries] = row
             pairs = per_cell[0] = int(entries > 0)
             control[0], cost[0], end[0] = 0, mean[0, 0], entries
         else:
-            key = np.empty((sampler.samples, high * wide), dtype=self.key)
+            key = np.empty((sampler.samples, high * wide), dtype=self.numbers.group.dtype)
             pairs, entries = merge(
-                index, block.cells_last, mean, self.number, self.group, self.bits,
-                self.first_code, key, high, wide, per_cell, control, cost, end, target, code,
+                index, block.cells_last, mean, self.numbers, key, high, wide, rows
             )  # fmt: skip
         control, cost = control[:pairs], cost[:pairs]
         if block.controls[0]:
@@ -306,7 +287,7 @@ class _Assembler:
             k = int(np.isnan(cost).argmax())
             cell = block.cells[np.searchsorted(np.cumsum(per_cell), k, side="right")]
             _refuse_cost(sampler, int(cell), int(control[k]))
-        return block, _BlockRows(
+        return block, BlockRows(
             per_cell, control, cost, end[:pairs], target[:entries], code[:entries]
         )
 

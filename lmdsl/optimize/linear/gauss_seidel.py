@@ -6,7 +6,7 @@ Staying put is summed up at once: x_i = (b_i + sum over j != i of M_ij x_j) / (1
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,16 @@ TOLERANCE = 2e-15
 CEILING = 1e305
 NEVER = 1e308
 SPLIT = 100_000
+
+
+class SplitArrays(NamedTuple):
+    """The arrays of a :class:`SplitMatrix`, as compiled loops take them."""
+
+    begin: NDArray[np.uint64]
+    end: NDArray[np.uint64]
+    indices: NDArray[np.uint32]
+    data: Floats
+    inverse: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +52,11 @@ class SplitMatrix:
     data: Floats
     inverse: Floats
     directions: Directions
+
+    @property
+    def kernel(self) -> SplitArrays:
+        """The arrays as compiled loops take them."""
+        return SplitArrays(self.begin, self.end, self.indices, self.data, self.inverse)
 
     @classmethod
     def of(cls, M: Any) -> SplitMatrix:
@@ -81,10 +96,8 @@ class SplitMatrix:
         """Make Gauss-Seidel sweeps for x = b + M x in place; see :func:`_gauss_seidel`."""
         if len(x) >= SPLIT:  # by size alone: the result does not depend on the threads
             return _in_halves(self, b, x, count, enough, flat)
-        halfway, last = _gauss_seidel(
-            self.begin, self.end, self.indices, self.data, self.inverse,
-            self.directions.orders, self.directions.cycle, b, x, count, enough, flat,
-        )  # fmt: skip
+        orders, cycle = self.directions.orders, self.directions.cycle
+        halfway, last = _gauss_seidel(self.kernel, orders, cycle, b, x, count, enough, flat)
         return float(halfway), float(last)
 
 
@@ -131,9 +144,7 @@ def _times(begin, end, indices, data, x, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _gauss_seidel(  # type: ignore[no-untyped-def]
-    begin, end, indices, data, inverse, orders, cycle, b, x, count, enough, flat
-):
+def _gauss_seidel(system, orders, cycle, b, x, count, enough, flat):  # type: ignore[no-untyped-def]
     """Sweep over the components, in all directions in turn, using each as soon as known.
 
     Staying put is summed up at once, so a chain of slow cells takes one sweep in its direction.
@@ -146,9 +157,9 @@ def _gauss_seidel(  # type: ignore[no-untyped-def]
     for sweep in range(count):
         measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
         turn = sweep % len(cycle)
+        order, downwards = orders[cycle[turn, 0]], cycle[turn, 1] == 1
         moved, most, highest = _sweep(
-            0, len(b), begin, end, indices, data, inverse, b, x, x,
-            orders[cycle[turn, 0]], cycle[turn, 1] == 1, measured, top,
+            0, len(b), system, b, x, x, order, downwards, measured, top
         )  # fmt: skip
         if measured:
             change, top = moved, highest
@@ -164,13 +175,12 @@ def _gauss_seidel(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sweep(  # type: ignore[no-untyped-def]
-    first, last, begin, end, indices, data, inverse, b, old, x, order, downwards, measured, top
-):
+def _sweep(first, last, system, b, old, x, order, downwards, measured, top):  # type: ignore[no-untyped-def]
     """Sweep over a range, in some order: ``x`` inside it, ``old`` outside; ``top`` was the largest.
 
     Returns the largest relative change, the largest absolute one, and the largest component.
     """
+    begin, end, indices, data, inverse = system
     floor, change, most, highest = 1e-14 * top + 1e-300, 0.0, 0.0, 0.0
     first, last = np.uint64(first), np.uint64(last)
     alone = first == np.uint64(0) and last == np.uint64(len(b))
@@ -212,8 +222,8 @@ def _in_halves(
         new[first:last] = old[first:last]
         order, downwards = cycle[sweep % len(cycle)]
         return _sweep(
-            first, last, system.begin, system.end, system.indices, system.data, system.inverse,
-            b, old, new, orders[order, first:last], downwards == 1, measured, highest,
+            first, last, system.kernel, b, old, new,
+            orders[order, first:last], downwards == 1, measured, highest,
         )  # fmt: skip
 
     for sweep in range(count):

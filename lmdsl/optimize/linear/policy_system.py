@@ -1,16 +1,27 @@
 """The system of a policy, x = b + gamma P_u x: rows of the model made ready for sweeps."""
 
-from typing import Any, Self
+from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lmdsl.common.types import Indices, Pairs
 from lmdsl.machine import threads
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.rows import Rows, spans
-from lmdsl.optimize.linear.gauss_seidel import NEVER, SplitMatrix
+from lmdsl.model.rows import RowArrays, Rows, spans
+from lmdsl.optimize.linear.gauss_seidel import NEVER, SplitArrays, SplitMatrix
+
+
+class SlotArrays(NamedTuple):
+    """The row copied for each cell, all rows, and the system, as compiled loops use them."""
+
+    copied: NDArray[np.uint64]
+    rows: RowArrays
+    columns: np.uint32
+    gamma: float
+    system: SplitArrays
 
 
 class Slots:
@@ -48,7 +59,7 @@ class Slots:
         capacity = np.empty(len(pair_pointer) - 1, dtype=np.int64)
 
         def longest(span: tuple[int, int]) -> None:
-            _longest(*span, pair_pointer.view(np.uint64), rows.kernel[0], capacity)
+            _longest(*span, pair_pointer.view(np.uint64), rows.kernel.pointer, capacity)
 
         threads.each(longest, spans(len(capacity)))
         return cls(rows, capacity, gamma, directions)
@@ -58,19 +69,16 @@ class Slots:
         now = chosen.view(np.uint64)
 
         def fill(span: tuple[int, int]) -> None:
-            _fill(*span, now, *self.kernel)
+            _fill(*span, now, self.kernel)
 
         threads.each(fill, spans(len(chosen)))
         return self.current
 
     @property
-    def kernel(self) -> tuple[Any, ...]:
-        """The row held of each cell, all rows, and the system, as compiled loops use them."""
-        s, columns = self.current, np.uint32(self.rows.columns)
-        return (
-            self.chosen, *self.rows.kernel, columns, self.gamma,
-            s.begin, s.end, s.indices, s.data, s.inverse,
-        )  # fmt: skip
+    def kernel(self) -> SlotArrays:
+        """The arrays as compiled loops use them."""
+        columns = np.uint32(self.rows.columns)
+        return SlotArrays(self.chosen, self.rows.kernel, columns, self.gamma, self.current.kernel)
 
 
 @kernel
@@ -85,24 +93,18 @@ def _longest(first, last, pair_pointer, pointer, capacity):  # type: ignore[no-u
 
 
 @kernel
-def _fill(  # type: ignore[no-untyped-def]
-    first, last, rows, before, pointer, target, code, share, columns, gamma, begin, end, indices,
-    data, inverse,
-):  # fmt: skip
+def _fill(first, last, chosen, slots):  # type: ignore[no-untyped-def]
     for r in range(np.uint64(first), np.uint64(last)):
-        if rows[r] != before[r]:
-            before[r] = rows[r]
-            copy_row(
-                r, rows[r], pointer, target, code, share, columns, gamma,
-                begin, end, indices, data, inverse,
-            )  # fmt: skip
+        if chosen[r] != slots.copied[r]:
+            copy_row(r, chosen[r], slots)
 
 
 @kernel
-def copy_row(  # type: ignore[no-untyped-def]
-    r, k, pointer, target, code, share, columns, gamma, begin, end, indices, data, inverse
-):
-    """Copy row k as row r of a system: the diagonal apart, without the attractor's share."""
+def copy_row(r, k, slots):  # type: ignore[no-untyped-def]
+    """Copy row k as row r of the system: the diagonal apart, without the attractor's share."""
+    copied, (pointer, target, code, share), columns, gamma, system = slots
+    begin, end, indices, data, inverse = system
+    copied[r] = k
     own, used = 0.0, begin[r]
     for e in range(pointer[k], pointer[k + ONE]):
         j = target[e]

@@ -90,11 +90,10 @@ class Peeled:
 
     def substitute(self, b: Floats, x: Floats) -> bool:
         """Solve x = b + M x outside the core in place; False where there is no finite solution."""
-        s = self.system
 
         def part(span: tuple[int, int]) -> bool:
             cells = self.order[span[0] : span[1]]
-            return bool(_back(cells, s.begin, s.end, s.indices, s.data, s.inverse, b, x))
+            return bool(_back(cells, self.system.kernel, b, x))
 
         for first, last, large in reversed(self._spans):
             if large:
@@ -127,8 +126,7 @@ class Peeled:
         On the core x becomes b and what flows in from outside. False where there is no finite
         solution.
         """
-        s = self.system
-        return bool(_down(self.order, s.begin, s.end, s.indices, s.data, s.inverse, x))
+        return bool(_down(self.order, self.system.kernel, x))
 
 
 @kernel
@@ -196,7 +194,8 @@ def _take(core, begin, end, indices, data, number, out_indices, out_data):  # ty
 
 
 @kernel
-def _back(order, begin, end, indices, data, inverse, b, x):  # type: ignore[no-untyped-def]
+def _back(order, system, b, x):  # type: ignore[no-untyped-def]
+    begin, end, indices, data, inverse = system
     last = np.uint64(len(order))
     for t in range(last):
         i = order[last - ONE - t]
@@ -212,7 +211,8 @@ def _back(order, begin, end, indices, data, inverse, b, x):  # type: ignore[no-u
 
 
 @kernel
-def _down(order, begin, end, indices, data, inverse, x):  # type: ignore[no-untyped-def]
+def _down(order, system, x):  # type: ignore[no-untyped-def]
+    begin, end, indices, data, inverse = system
     for t in range(np.uint64(len(order))):
         i = order[t]
         y = x[i]

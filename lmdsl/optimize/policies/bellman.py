@@ -50,10 +50,7 @@ def improve(
     cost = lp.cost if cost is None else cost
 
     def part(cells: tuple[int, int]) -> None:
-        _improve(
-            *cells, *lp._kernel,
-            cost, gamma, x, value, policy,
-        )  # fmt: skip
+        _improve(*cells, *lp._kernel, cost, gamma, x, value, policy)
 
     over_cells(lp, part)
     return Improvement(value, policy)
@@ -75,10 +72,8 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
     x = padded(V)
 
     def part(cells: tuple[int, int]) -> None:
-        _rise(
-            *cells, *lp._kernel,
-            gamma, x.copy(), backwards, value, policy,  # the others keep the values from before
-        )  # fmt: skip
+        own = x.copy()  # the others keep the values from before
+        _rise(*cells, *lp._kernel, gamma, own, backwards, value, policy)
 
     over_cells(lp, part, IN_PLACE)
     return Improvement(value, policy)
@@ -89,10 +84,7 @@ def below(lp: StabilizationLP, V: Floats, limit: Floats) -> Bools:
     found, x = np.empty(lp.K, dtype=np.bool_), padded(V)
 
     def part(cells: tuple[int, int]) -> None:
-        _below(
-            *cells, *lp._kernel,
-            lp.cost, lp.gamma, x, limit, found,
-        )  # fmt: skip
+        _below(*cells, *lp._kernel, lp.cost, lp.gamma, x, limit, found)
 
     over_cells(lp, part)
     return found
@@ -104,9 +96,8 @@ def tied(lp: StabilizationLP, V: Floats, best: Floats, tolerance: float) -> Bool
 
 
 @kernel
-def _improve(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, value, policy
-):
+def _improve(first, last, pair_pointer, rows, cost, gamma, V, value, policy):  # type: ignore[no-untyped-def]
+    pointer, target, code, share = rows
     for i in range(np.uint64(first), np.uint64(last)):
         best, choice = np.inf, pair_pointer[i]
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
@@ -120,9 +111,8 @@ def _improve(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _below(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, limit, found
-):
+def _below(first, last, pair_pointer, rows, cost, gamma, V, limit, found):  # type: ignore[no-untyped-def]
+    pointer, target, code, share = rows
     for i in range(np.uint64(first), np.uint64(last)):
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             q = 0.0
@@ -132,9 +122,8 @@ def _below(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _rise(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, gamma, x, backwards, value, policy
-):
+def _rise(first, last, pair_pointer, rows, gamma, x, backwards, value, policy):  # type: ignore[no-untyped-def]
+    pointer, target, code, share = rows
     first, last = np.uint64(first), np.uint64(last)
     for t in range(last - first):
         i = last - ONE - t if backwards else first + t

@@ -11,8 +11,10 @@ all rows of a cell in less time than it takes to find out which of them to read.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Pairs
 from lmdsl.machine.forking import cached_property
@@ -46,6 +48,38 @@ class Pass:
     policy: Pairs
     changed: int
     looked: int
+
+
+class Rivals(NamedTuple):
+    """The control of each cell and what is known of its rivals, as compiled loops use them.
+
+    Attributes
+    ----------
+    policy
+        A pair of each cell, shape (n,).
+    bound, scale
+        ``bound * scale`` is below the Q of every rival; shape (n,).
+    """
+
+    policy: NDArray[np.uint64]
+    bound: Floats
+    scale: float
+
+
+class Improved(NamedTuple):
+    """What a pass finds, as compiled loops write it: see :class:`Pass` and :class:`Screen`."""
+
+    value: Floats
+    policy: NDArray[np.uint64]
+    policy_cost: Floats
+
+
+class Tied(NamedTuple):
+    """The tied columns, the first of each cell, and space for the Q of a cell's pairs."""
+
+    ties: Bools
+    first: Pairs
+    q: Floats
 
 
 class Screen:
@@ -101,12 +135,13 @@ class Screen:
         value, new = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
         x, backwards = vectors.padded(V), self.passes % 2 == 1
         self.passes += 1
-        own, slots = policy.view(np.uint64), self.slots.kernel
+        rivals = Rivals(policy.view(np.uint64), self.rival, self.scale)
+        found = Improved(value, new.view(np.uint64), self.policy_cost)
+        pair_pointer, slots = lp._kernel[0], self.slots.kernel
 
         def part(cells: tuple[int, int]) -> tuple[int, int]:
             changed, looked = _pass(
-                *cells, lp._kernel[0], self.cost, x.copy(), own, margin, self.scale, backwards,
-                self.rival, value, new.view(np.uint64), self.policy_cost, *slots,
+                *cells, pair_pointer, slots, self.cost, x.copy(), margin, backwards, rivals, found
             )  # fmt: skip
             return int(changed), int(looked)
 
@@ -132,18 +167,17 @@ class Screen:
         """
         lp = self.lp
         x, ties = vectors.padded(V), np.empty(lp.K, dtype=np.bool_)
-        first, own = np.empty(lp.n, dtype=np.int64), policy.view(np.uint64)
+        first = np.empty(lp.n, dtype=np.int64)
         known = self.policy is not None and np.array_equal(self.policy, policy)
-        rival = self.rival if known else np.zeros(lp.n)
+        bound = self.rival if known else np.zeros(lp.n)
+        rivals = Rivals(policy.view(np.uint64), bound, self.scale)
         most = int(np.diff(lp.pair_pointer).max(initial=0))
 
         def part(cells: tuple[int, int]) -> bool:
-            several = _ties(
-                *cells, *lp._kernel,
-                self.cost, self.gamma, x, tolerance, self.scale, rival, own, ties,
-                first, np.empty(most),
-            )  # fmt: skip
-            return bool(several)
+            found = Tied(ties, first, np.empty(most))
+            return bool(
+                _ties(*cells, *lp._kernel, self.cost, self.gamma, x, tolerance, rivals, found)
+            )
 
         return ties, first, any(vectors.over_cells(lp, part))
 
@@ -162,17 +196,16 @@ def _least_ratio(before: Floats, after: Floats) -> float:
 
 
 @kernel
-def _pass(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, cost, x, policy, margin, scale, backwards, rival, value, new,
-    policy_cost, current, pointer, target, code, share, columns, gamma, begins, ends, indices,
-    data, inverse,
-):  # fmt: skip
-    """Improve the cells of a range in turn; ``rival`` gets the bounds of those that were read.
+def _pass(first, last, pair_pointer, slots, cost, x, margin, backwards, rivals, found):  # type: ignore[no-untyped-def]
+    """Improve the cells of a range in turn; ``rivals`` gets the bounds of those that were read.
 
     ``x`` is V, a copy for each range: the others keep the values from before the pass.
 
     V_i >= Q of the cell's own pair, so where the bound of the rivals is V_i or more none is better.
     """
+    pointer, target, code, share = slots.rows
+    (policy, rival, scale), (value, new, policy_cost) = rivals, found
+    gamma, copied = slots.gamma, slots.copied
     changed, looked = 0, np.uint64(0)
     first, last = np.uint64(first), np.uint64(last)
     store, shrink = (1.0 - 1e-12) / scale, 1.0 / scale
@@ -206,27 +239,22 @@ def _pass(  # type: ignore[no-untyped-def]
             if best < x[i]:
                 x[i] = best
             rival[i] = second * store if second * store < MOST else MOST
-        if current[i] != new[i]:  # its row is at hand now
-            current[i] = new[i]
+        if copied[i] != new[i]:  # its row is at hand now
             policy_cost[i] = cost[new[i]]
-            copy_row(
-                i, new[i], pointer, target, code, share, columns, gamma,
-                begins, ends, indices, data, inverse,
-            )  # fmt: skip
+            copy_row(i, new[i], slots)
     for i in range(first, last):
         value[i] = x[i]
     return changed, looked
 
 
 @kernel
-def _ties(  # type: ignore[no-untyped-def]
-    first, last, pair_pointer, pointer, target, code, share, cost, gamma, V, tolerance, scale,
-    rival, policy, ties, chosen, q,
-):  # fmt: skip
+def _ties(first, last, pair_pointer, rows, cost, gamma, V, tolerance, rivals, found):  # type: ignore[no-untyped-def]
     """Mark the tied columns of a range of cells: first Q_min, then all that come near.
 
-    Where no rival comes near, no row is read. ``q`` is room for the pairs of a cell.
+    Where no rival comes near, no row is read.
     """
+    pointer, target, code, share = rows
+    (policy, rival, scale), (ties, chosen, q) = rivals, found
     several = False
     first, last = np.uint64(first), np.uint64(last)
     for i in range(first, last):
