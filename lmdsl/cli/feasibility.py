@@ -1,25 +1,23 @@
 """``gamma-max`` and ``explain``: what can be stabilized, and why the rest cannot."""
 
-from lmdsl.cli.output import Arguments, Command, ProgressLine, as_json, print_json
+from lmdsl.cli.output import Arguments, Command, ProgressLine, answer, print_json, shared
 from lmdsl.cli.streams import say
 
 
 def add(command: Command) -> None:
     """Add the commands of this module."""
     limit = command("gamma-max", _gamma_max, "Enclose the largest feasible gamma.")
-    limit.add_argument("file", metavar="FILE", help="problem file")
-    limit.add_argument("--time-limit", type=float, metavar="S", help="seconds")
+    shared(limit, "file", "--time-limit")
     limit.add_argument("--width", type=float, default=1e-6, metavar="W",
                        help="relative width asked for, 1e-8 to 1 (1e-6)")  # fmt: skip
-    as_json(limit)
+    shared(limit, "--json")
 
     explain = command("explain", _explain, "Say which cells cannot be stabilized, why, and what "
                       "would help.")  # fmt: skip
-    explain.add_argument("file", metavar="FILE", help="problem file")
+    shared(explain, "file")
     explain.add_argument("--phase-one", action="store_true",
                          help="phase-one LP: how much mass cannot be stabilized")  # fmt: skip
-    explain.add_argument("--time-limit", type=float, metavar="S", help="seconds")
-    as_json(explain)
+    shared(explain, "--time-limit", "--json")
 
 
 def _gamma_max(parsed: Arguments) -> int:
@@ -29,10 +27,7 @@ def _gamma_max(parsed: Arguments) -> int:
     problem = load(parsed.file)
     with ProgressLine() as progress:
         found = gamma_max(problem, progress, parsed.time_limit, parsed.width)
-    if parsed.json:
-        print_json(found.to_dict())
-    else:
-        say(found.text())
+    answer(parsed, found)
     return 0 if found.stabilizable else 3
 
 
@@ -42,12 +37,8 @@ def _explain(parsed: Arguments) -> int:
 
     problem = load(parsed.file)
     with ProgressLine() as progress:
-        found = explain(
-            problem,
-            phase_one=parsed.phase_one,
-            time_limit=parsed.time_limit,
-            progress=progress,
-        )
+        limit = parsed.time_limit
+        found = explain(problem, phase_one=parsed.phase_one, time_limit=limit, progress=progress)
         text = "" if parsed.json else found.text()
     if parsed.json:
         print_json(found.to_dict())

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from lmdsl.cli.output import Arguments, Command, as_json, print_json
+from lmdsl.cli.output import Arguments, Command, print_json, shared
 from lmdsl.cli.streams import say
 from lmdsl.errors import BadInput, printable, shown
 
@@ -11,11 +11,11 @@ from lmdsl.errors import BadInput, printable, shown
 def add(command: Command) -> None:
     """Add the commands of this module."""
     command("schema", _schema, "Print the JSON Schema of the problem file.")
-    as_json(command("systems", _systems, "List the systems known by name."))
+    shared(command("systems", _systems, "List the systems known by name."), "--json")
     init = command("init", _init, "Write the default problem of a named system.")
     init.add_argument("name", metavar="NAME", help="a system (see `lmdsl systems`)")
     init.add_argument("--out", metavar="FILE", help="file to write (default NAME.json)")
-    as_json(command("backends", _backends, "List the backends."))
+    shared(command("backends", _backends, "List the backends."), "--json")
 
 
 def _schema(parsed: Arguments) -> int:
@@ -79,14 +79,8 @@ def _backends(parsed: Arguments) -> int:
     width = max(map(len, listed))
     for name, entry in listed.items():
         if entry["available"]:
-            missing = entry["not_installed"]
-            shown_names = [
-                f"{algorithm} (not installed: {missing[algorithm]})"
-                if algorithm in missing
-                else algorithm
-                for algorithm in entry["algorithms"]
-            ]
-            text = ", ".join(shown_names) or "any"
+            missing = {k: f" (not installed: {v})" for k, v in entry["not_installed"].items()}
+            text = ", ".join(k + missing.get(k, "") for k in entry["algorithms"]) or "any"
             mark = " (default)" if name == backends.DEFAULT else ""
             say(f"{name.ljust(width)}  algorithms: {text}{mark}")
         else:

@@ -20,14 +20,31 @@ Command = Callable[[str, Run, str], argparse.ArgumentParser]
 """Adds a command: its name, what runs it, its help."""
 
 
-def as_json(sub: argparse.ArgumentParser) -> None:
-    """Add the option --json to a command."""
-    sub.add_argument("--json", action="store_true", help="print one JSON object on stdout")
+SHARED: dict[str, dict[str, Any]] = {
+    "file": {"metavar": "FILE", "help": "problem file"},
+    "dir": {"metavar": "DIR", "help": "result directory"},
+    "--time-limit": {"type": float, "metavar": "S", "help": "seconds"},
+    "--json": {"action": "store_true", "help": "print one JSON object on stdout"},
+}
+
+
+def shared(sub: argparse.ArgumentParser, *options: str) -> None:
+    """Add options that several commands have."""
+    for option in options:
+        sub.add_argument(option, **SHARED[option])
 
 
 def print_json(data: Any, indent: int | None = None) -> None:
     """Print strict JSON."""
     say(json.dumps(data, allow_nan=False, indent=indent))
+
+
+def answer(parsed: Arguments, found: Any) -> None:
+    """Print what was found, as JSON where that was asked for."""
+    if parsed.json:
+        print_json(found.to_dict())
+    else:
+        say(str(found))
 
 
 class ProgressLine:

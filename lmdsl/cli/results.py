@@ -1,11 +1,10 @@
 """What is done with a result directory: ``verify``, ``simulate``, ``plot``, ``export``."""
 
-import argparse
 import sys
 from importlib import import_module
 from pathlib import Path
 
-from lmdsl.cli.output import Arguments, Command, ProgressLine, as_json, print_json
+from lmdsl.cli.output import Arguments, Command, ProgressLine, answer, print_json, shared
 from lmdsl.cli.streams import say
 from lmdsl.errors import printable
 from lmdsl.results.formats import FORMATS
@@ -16,36 +15,30 @@ AS_STORED = "the result as stored, not re-checked; see lmdsl verify"
 def add(command: Command) -> None:
     """Add the commands of this module."""
     verify = command("verify", _verify, "Recompile a saved result and check every claim.")
-    verify.add_argument("dir", metavar="DIR", help="result directory")
+    shared(verify, "dir")
     verify.add_argument("--exact", action="store_true",
                         help="judge in rational arithmetic, without tolerance")  # fmt: skip
-    _time_limit(verify)
-    as_json(verify)
+    shared(verify, "--time-limit", "--json")
 
     simulate = command("simulate", _simulate, "Run the true map under a saved controller.")
-    simulate.add_argument("dir", metavar="DIR", help="result directory")
+    shared(simulate, "dir")
     simulate.add_argument("--starts", type=int, default=10_000, metavar="N")
     simulate.add_argument("--steps", type=int, default=10_000, metavar="T")
     simulate.add_argument("--seed", type=int, default=0, metavar="S")
     simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
                           help="with a local controller, steps after reaching A")  # fmt: skip
-    _time_limit(simulate)
-    as_json(simulate)
+    shared(simulate, "--time-limit", "--json")
 
     plot = command("plot", _plot, "Draw the figures of a saved result.")
-    plot.add_argument("dir", metavar="DIR", help="result directory")
+    shared(plot, "dir")
     plot.add_argument("--out", metavar="FILE", help="PNG, PDF or SVG (default DIR/figures.png)")
 
     export = command("export", _export, "Write a saved result in a format for other readers.")
-    export.add_argument("dir", metavar="DIR", help="result directory")
+    shared(export, "dir")
     uses = "; ".join(f"{name}: {use}" for name, use in FORMATS.items())
     export.add_argument("--format", required=True, choices=FORMATS, help=uses)
     export.add_argument("--out", required=True, metavar="FILE", help="file to write")
-    _time_limit(export)
-
-
-def _time_limit(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--time-limit", type=float, metavar="S", help="seconds")
+    shared(export, "--time-limit")
 
 
 def _verify(parsed: Arguments) -> int:
@@ -55,10 +48,7 @@ def _verify(parsed: Arguments) -> int:
         found = verify(
             parsed.dir, exact=parsed.exact, progress=progress, time_limit=parsed.time_limit
         )
-    if parsed.json:
-        print_json(found.to_dict())
-    else:
-        say(found.text())
+    answer(parsed, found)
     return 0 if found.holds else 1
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lmdsl.cli.output import Arguments, Command, ProgressLine, as_json, print_json
+from lmdsl.cli.output import Arguments, Command, ProgressLine, answer, print_json, shared
 from lmdsl.cli.streams import say, tell
 from lmdsl.errors import LmdslError, plain_text, printable
 from lmdsl.results.status import Status
@@ -29,23 +29,22 @@ def add(command: Command) -> None:
     solve.add_argument("--out", metavar="DIR", help="write controller and certificate to DIR")
     solve.add_argument("--no-simulate", dest="simulate", action="store_false",
                        help="make no runs of the true map")  # fmt: skip
-    as_json(solve)
+    shared(solve, "--json")
 
     compare = command("compare", _compare, "Solve with several backends and compare.")
     _problem_options(compare)
     compare.add_argument("--backends", default="policy-iteration,highs,clarabel,cvxpy",
                          metavar="A,B", help="comma-separated backends")  # fmt: skip
-    as_json(compare)
+    shared(compare, "--json")
 
 
 def _problem_options(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("file", metavar="FILE", help="problem file")
+    shared(sub, "file")
     sub.add_argument("--gamma", type=float, metavar="G", help="override gamma")
     sub.add_argument("--tolerance", type=float, default=1e-6, metavar="T",
                      help="largest gap that counts as verified (default 1e-6)")  # fmt: skip
-    sub.add_argument(
-        "--time-limit", type=float, metavar="S", help="seconds for compiling and solving"
-    )
+    sub.add_argument("--time-limit", type=float, metavar="S",
+                     help="seconds for compiling and solving")  # fmt: skip
 
 
 def _problem(parsed: Arguments) -> Any:
@@ -138,10 +137,7 @@ def _compare(parsed: Arguments) -> int:
         )
     for result in comparison.results:
         tell(result.log)
-    if parsed.json:
-        print_json(comparison.to_dict())
-    else:
-        say(comparison.table())
+    answer(parsed, comparison)
     return comparison.exit_status
 
 

@@ -8,8 +8,18 @@ from typing import Any
 import numpy as np
 
 
+class Reported:
+    """Base of dataclasses that are reported field by field."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return strict JSON data: every field by its name."""
+        return {f.name: jsonable(getattr(self, f.name)) for f in fields(self)}  # type: ignore[arg-type]
+
+
 def jsonable(value: Any) -> Any:
     """Return plain data that strict JSON can hold."""
+    if hasattr(value, "to_dict"):
+        return jsonable(value.to_dict())
     if is_dataclass(value) and not isinstance(value, type):
         return {f.name: jsonable(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, tuple | list):

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic.json_schema import GenerateJsonSchema
 
 from lmdsl.common.faults import condensed
 from lmdsl.common.files import strict_json
@@ -53,6 +54,21 @@ class SchemaWords:
 
     def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
         return {**handler(core), **self.words}
+
+
+class FileSchema(GenerateJsonSchema):
+    """The schema of what a file may hold: no null."""
+
+    def nullable_schema(self, schema: Any) -> Any:
+        """Leave null out."""
+        return self.generate_inner(schema["schema"])
+
+    def default_schema(self, schema: Any) -> Any:
+        """Leave out a default that is null."""
+        generated = super().default_schema(schema)
+        if generated.get("default", 0) is None:
+            del generated["default"]
+        return generated
 
 
 # A bound stands directly behind its type, before any validator: only there does pydantic write it

@@ -5,12 +5,13 @@ is cut into boxes until the enclosed image of each meets attractor cells only. T
 proved of the map as computed, with its rounding, and so of what a simulation can do.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from lmdsl.common.json_values import Reported
 from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.formulas.enclosures import Jet, apply, enclosure
 from lmdsl.formulas.intervals import Interval, subtract
@@ -33,7 +34,7 @@ DOING = "checking the local controller"
 
 
 @dataclass(frozen=True)
-class LocalCheck:
+class LocalCheck(Reported):
     """Whether the local controller keeps the attractor cells: T(x, C0(x), w) in A for x in A.
 
     Attributes
@@ -58,10 +59,6 @@ class LocalCheck:
     proved: int | None
     samples: int
     kept: int
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
-        return asdict(self)
 
     def sentence(self) -> str:
         """Return one line for people."""

@@ -22,7 +22,7 @@ from lmdsl.model import stabilizable_set
 from lmdsl.model.assembly.sampler import Sampler
 from lmdsl.model.assembly.transitions import Transitions, assemble
 from lmdsl.model.grid import boxes
-from lmdsl.model.grid.boxes import Region
+from lmdsl.model.grid.boxes import Area, Region
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import LOST, CellStatus
@@ -255,12 +255,9 @@ def explain(
         progress("explain", -1.0)
     found = []
     for code in LOST:
-        mask = status == code
-        if mask.any():
-            parts = boxes.regions(partition, mask, regions)
-            cells = int(mask.sum())
-            inside = sum(part.cells for part in parts)
-            found.append(LostCells(NAMES[code], cells, parts, cells - inside))
+        area = Area.of(partition, np.flatnonzero(status == code), regions)
+        if len(area):
+            found.append(LostCells(NAMES[code], len(area), area.regions, area.elsewhere))
     solved = None
     if phase_one and assembled is not None:
         solved = PhaseOne.of(partition, assembled, status, problem.gamma, deadline)

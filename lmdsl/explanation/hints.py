@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.json_values import jsonable
+from lmdsl.common.json_values import Reported
 from lmdsl.common.types import Bools, Floats, Indices, Statuses
 from lmdsl.model.assembly.sampler import CHUNK, Sampler
 from lmdsl.model.discretization import control_values
 from lmdsl.model.grid.axis import EDGE
-from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.stabilizable_set import LOST, CellStatus
 
 STEPS, NEAR, SUPPORT, QUANTILE = 64, 0.25, 0.05, 0.9
 MOST_CELLS, MOST_CONTROLS, MOST_POINTS, MOST_NODES = 512, 64, 16, 4
@@ -39,7 +39,7 @@ BEYOND = (0.0, 0.125, 0.25, 0.5, 1.0)
 
 
 @dataclass(frozen=True)
-class Hint:
+class Hint(Reported):
     """Something that would help, and the numbers that support it.
 
     Attributes
@@ -56,18 +56,10 @@ class Hint:
     text: str
     numbers: dict[str, Any]
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return strict JSON data."""
-        return {"kind": self.kind, "text": self.text, "numbers": jsonable(self.numbers)}
-
 
 def hints(sampler: Sampler, status: Statuses) -> tuple[Hint, ...]:
     """Return the hints that trials support, given the status of all cells (N,)."""
-    lost = (
-        (status == CellStatus.ESCAPES)
-        | (status == CellStatus.TRAPPED)
-        | (status == CellStatus.LEADS_TO_THESE)
-    )
+    lost = np.isin(status, LOST)
     if not lost.any():
         return ()
     trial = _Trial(sampler, status)

@@ -78,7 +78,8 @@ class Move(Frozen):
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data."""
         sides = [{"axis": axis, "end": end, "beyond": by} for axis, end, by in self.sides]
-        return {name: jsonable(value) for name, value in {**vars(self), "sides": sides}.items()}
+        found: dict[str, Any] = jsonable({**vars(self), "sides": sides})
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,12 +140,8 @@ class Why(Frozen):
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data."""
-        return {
-            **{name: jsonable(value) for name, value in vars(self).items()},
-            "first": self.first,
-            "moves": [move.to_dict() for move in self.moves],
-            "trap": [region.to_dict() for region in self.trap],
-        }
+        found: dict[str, Any] = jsonable(vars(self))
+        return {**found, "first": self.first}
 
 
 def _shown(named: Named) -> str:

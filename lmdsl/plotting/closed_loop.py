@@ -14,11 +14,10 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.plotting import layers, overlays, runs
 from lmdsl.plotting.plots import _codes, _view
 from lmdsl.plotting.view import At
+from lmdsl.results.result import Result
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from lmdsl.results.result import Result
 
 
 @own_arithmetic

@@ -17,13 +17,12 @@ from lmdsl.plotting import layers, overlays
 from lmdsl.plotting.closed_loop import trajectories
 from lmdsl.plotting.plots import _bytes, _view, control, cost, measure, portrait
 from lmdsl.plotting.view import At, number, plain
+from lmdsl.results.result import Result
 
 if TYPE_CHECKING:
     import os
 
     from matplotlib.figure import Figure
-
-    from lmdsl.results.result import Result
 
 PAGE = 2e8
 """Bytes for a page as pixels, and for matplotlib."""

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from lmdsl.common import inputs
 from lmdsl.common.types import Floats, Statuses
 from lmdsl.errors import BadInput, shown
+from lmdsl.explanation.causes import Explanation
 from lmdsl.machine import memory
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.discretization import control_values
@@ -29,13 +30,11 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.plotting import layers, overlays, runs
 from lmdsl.plotting.view import At, View, number, plain
 from lmdsl.problem.problem import Problem
+from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-    from lmdsl.explanation.causes import Explanation
-    from lmdsl.results.result import Result
 
 
 @own_arithmetic
@@ -73,7 +72,7 @@ def portrait(
     -------
     matplotlib.axes.Axes
     """
-    inputs.kind(problem, (Problem, _result()), "problem", "a Problem or a Result")
+    inputs.kind(problem, (Problem, Result), "problem", "a Problem or a Result")
     given = problem if isinstance(problem, Problem) else problem.problem
     for name, count in (("starts", starts), ("steps", steps)):
         if count is not None:
@@ -177,8 +176,6 @@ def causes(
     -------
     matplotlib.axes.Axes
     """
-    from lmdsl.explanation.causes import Explanation
-
     inputs.kind(explanation, Explanation, "explanation", "what lmdsl.explain returns")
     status = explanation.cell_status
     view = View.of(explanation.partition, status == CellStatus.ATTRACTOR, axes, at)
@@ -224,7 +221,7 @@ def control(
     BadInput
         There is no such control.
     """
-    inputs.kind(result, _result(), "result", "a Result")
+    inputs.kind(result, Result, "result", "a Result")
     names = result.problem.controls
     if not names:
         raise BadInput("the system is autonomous: it has no control to draw", "control_grid")
@@ -284,14 +281,8 @@ def measure(
     return drawn
 
 
-def _result() -> type[Result]:
-    from lmdsl.results.result import Result
-
-    return Result
-
-
 def _view(result: Result, axes: Sequence[str] | None, at: At | None) -> View:
-    inputs.kind(result, _result(), "result", "a Result")
+    inputs.kind(result, Result, "result", "a Result")
     view = View.of(result.partition, result.cell_status == CellStatus.ATTRACTOR, axes, at)
     memory.require(_bytes(view, 150), "a plot")
     return view

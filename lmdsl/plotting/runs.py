@@ -1,9 +1,7 @@
 """Runs of the true map for plots: at a constant control, and in closed loop."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,11 +16,9 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
+from lmdsl.results.result import Result
 from lmdsl.systems.base import OdeSystem
 from lmdsl.systems.named import NamedOde
-
-if TYPE_CHECKING:
-    from lmdsl.results.result import Result
 
 PIECES = 8
 """Drawn lines of a differential equation have so many pieces a step."""

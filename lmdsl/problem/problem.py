@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from lmdsl.common import inputs
 from lmdsl.common.files import read_json, write_whole
-from lmdsl.common.strict_model import Declared, Positive
+from lmdsl.common.strict_model import Declared, FileSchema, Positive
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.language import Formula, parse
 from lmdsl.formulas.names import FormulaText
@@ -22,9 +22,8 @@ from lmdsl.problem.controls import ControlGrid
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LocalUnion, LqrFeedback
 from lmdsl.problem.noise import Noise
 from lmdsl.problem.sampling import SamplingUnion
-from lmdsl.problem.schema import FileSchema
 from lmdsl.problem.sets import Attractor, Avoid, Measure
-from lmdsl.problem.system_kinds import SystemUnion
+from lmdsl.problem.unions import SystemUnion
 from lmdsl.systems import FunctionSystem, System
 from lmdsl.systems.base import StateMap
 

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from lmdsl.common import inputs
+from lmdsl.common.json_values import Reported
 from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, printable, shown
 from lmdsl.machine.deadline import TimeLimitReached
@@ -25,7 +26,7 @@ BACKENDS = ("policy-iteration", "highs", "clarabel", "cvxpy")
 
 
 @dataclass(frozen=True)
-class Agreement:
+class Agreement(Reported):
     """How far the verified results agree.
 
     Attributes
@@ -43,13 +44,9 @@ class Agreement:
     controls: float
     value: float
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
-        return asdict(self)
-
 
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Reported):
     """Results by backend, in the order asked for, and their agreement.
 
     Attributes
@@ -62,14 +59,6 @@ class Comparison:
 
     results: tuple[Result, ...]
     agreement: Agreement | None
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
-        a = self.agreement
-        return {
-            "results": [result.to_dict() for result in self.results],
-            "agreement": a and a.to_dict(),
-        }
 
     @property
     def exit_status(self) -> int:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from lmdsl.certificate import sums
 from lmdsl.certificate.claims import Certificate
 from lmdsl.common import inputs
 from lmdsl.common.frozen import freeze
-from lmdsl.common.json_values import jsonable
+from lmdsl.common.json_values import Reported
 from lmdsl.common.types import Bools, Floats, Statuses
 from lmdsl.control.controller import Controller
 from lmdsl.control.simulation import ClosedLoop, Simulation, simulate
@@ -41,7 +41,7 @@ ARRAYS = ("control_index", "value", "lower", "measure", "cell_status")
 
 
 @dataclass(frozen=True)
-class CostFrom:
+class CostFrom(Reported):
     """The conditional cost of a starting region.
 
     Attributes
@@ -58,11 +58,6 @@ class CostFrom:
 
     def __str__(self) -> str:
         return f"cost between {self.lower:.9g} and {self.upper:.9g} from {self.mass:.4g} of m"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return strict JSON data."""
-        found: dict[str, Any] = jsonable(asdict(self))
-        return found
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)

@@ -1,12 +1,12 @@
 """The scalar part of a result."""
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 import numpy as np
 
 from lmdsl.common.frozen import Frozen
-from lmdsl.common.json_values import jsonable
+from lmdsl.common.json_values import Reported, jsonable
 from lmdsl.common.types import Statuses
 from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.simulation import Simulation
@@ -25,7 +25,7 @@ class Seconds:
 
 
 @dataclass(frozen=True)
-class Coverage:
+class Coverage(Reported):
     """How much of the box the controller serves; cells are equal shares of its volume.
 
     Attributes
@@ -53,10 +53,6 @@ class Coverage:
             return text
         percent = 100 * self.share if self.share == 1 else min(100 * self.share, 99.99)
         return f"{text} ({percent:.4g} %)"
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
-        return asdict(self)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,13 +112,12 @@ class Summary(Frozen):
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
-        covered, beyond, runs = self.coverage, self.beyond_gamma, self.simulation
         names = [f.name for f in fields(Summary) if f.name != "simulation"]
         return {
             **{name: jsonable(getattr(self, name)) for name in names},
-            "beyond_gamma": beyond and beyond.to_dict(),
-            "coverage": covered and covered.to_dict(),
-            "simulation": runs and jsonable(runs.to_dict()),
+            "beyond_gamma": jsonable(self.beyond_gamma),
+            "coverage": jsonable(self.coverage),
+            "simulation": jsonable(self.simulation),
         }
 
     @property

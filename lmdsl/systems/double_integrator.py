@@ -22,9 +22,7 @@ class DoubleIntegrator(NamedMap):
     )
     # The cost is time. Too fast towards a wall, no control can stop in time: those cells are lost.
     problem: ClassVar = {
-        "format": "lmdsl/1",
         "name": "double integrator, minimum time",
-        "system": {"kind": "double_integrator", "parameters": {"h": 0.15}},
         "state_box": {
             "x": {"low": -2, "high": 2, "cells": 80},
             "v": {"low": -1.5, "high": 1.5, "cells": 60},

@@ -23,9 +23,7 @@ class HenonMap(NamedMap):
     )
     # y in b times the range of x: only x can leave the box.
     problem: ClassVar = {
-        "format": "lmdsl/1",
         "name": "Henon map, saddle fixed point",
-        "system": {"kind": "henon_map", "parameters": {"a": 1.4, "b": 0.3}},
         "state_box": {
             "x": {"low": -1.4, "high": 1.4, "cells": 70},
             "y": {"low": -0.42, "high": 0.42, "cells": 48},

@@ -28,14 +28,7 @@ class InvertedPendulum(NamedOde):
     )
     # Holding the pendulum level takes m g l = 9.81 N m; the motor gives 3.
     problem: ClassVar = {
-        "format": "lmdsl/1",
         "name": "pendulum, swing-up with a weak motor",
-        "system": {
-            "kind": "inverted_pendulum",
-            "parameters": {"m": 1, "l": 1, "g": 9.81, "d": 0.1},
-            "step": 0.1,
-            "substeps": 2,
-        },
         "state_box": {
             "theta": {"low": -pi, "high": pi, "cells": 64, "periodic": True},
             "omega": {"low": -9, "high": 9, "cells": 64},

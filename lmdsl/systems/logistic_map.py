@@ -24,9 +24,7 @@ class LogisticMap(NamedMap):
     )
     # The fixed point is 0.7436. u enters the cost relative to its bound 0.02.
     problem: ClassVar = {
-        "format": "lmdsl/1",
         "name": "logistic map, unstable fixed point",
-        "system": {"kind": "logistic_map", "parameters": {"r": 3.9}},
         "state_box": {"x": {"low": 0, "high": 1, "cells": 200}},
         "attractor": {"boxes": [{"x": [0.74, 0.75]}]},
         "control_grid": {"u": {"low": -0.02, "high": 0.02, "points": 9}},

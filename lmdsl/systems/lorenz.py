@@ -33,14 +33,7 @@ class Lorenz(NamedOde):
     )
     # C+ is (8.485, 8.485, 27). The box holds the chaotic attractor with room to spare.
     problem: ClassVar = {
-        "format": "lmdsl/1",
         "name": "Lorenz system, steady convection",
-        "system": {
-            "kind": "lorenz",
-            "parameters": {"sigma": 10, "rho": 28, "beta": 8 / 3},
-            "step": 0.1,
-            "substeps": 5,
-        },
         "state_box": {
             "x": {"low": -24, "high": 24, "cells": 24},
             "y": {"low": -36, "high": 36, "cells": 24},

@@ -16,7 +16,8 @@ class NamedSystem(System):
     """A system known by name: its formulas are fixed, its parameters have defaults.
 
     A subclass sets ``defaults`` (parameter values), ``source`` (a citation), ``summary`` (one
-    line) and ``problem`` (the problem file that ``lmdsl init NAME`` writes).
+    line) and ``problem`` (the problem file that ``lmdsl init NAME`` writes, without ``format`` and
+    ``system``, which the other values say).
     """
 
     kind: str
@@ -24,6 +25,14 @@ class NamedSystem(System):
     source: ClassVar[str] = ""
     summary: ClassVar[str] = ""
     problem: ClassVar[Mapping[str, Any]] = {}
+    formulas: ClassVar[Mapping[str, str]] = {}
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **options: Any) -> None:
+        if cls.problem:
+            own = {key: field.default for key, field in cls.model_fields.items()}
+            system = {**own, "parameters": dict(cls.defaults)}
+            cls.problem = {"format": "lmdsl/1", "system": system, **cls.problem}
 
     @model_validator(mode="after")
     def _known_parameters(self) -> Self:
@@ -35,8 +44,6 @@ class NamedSystem(System):
                     "parameters",
                 )
         return self
-
-    formulas: ClassVar[Mapping[str, str]] = {}
 
     def constants(self) -> Mapping[str, float]:
         """Return the values of all parameters, defaults included."""

@@ -34,14 +34,7 @@ class PendulumOnCart(NamedOde):
     )
     # The cost is the sources' instantaneous cost times the sampling time.
     problem: ClassVar = {
-        "format": "lmdsl/1",
         "name": "inverted pendulum on a cart",
-        "system": {
-            "kind": "pendulum_on_cart",
-            "parameters": {"m": 2, "M": 8, "l": 0.5, "g": 9.8},
-            "step": 0.1,
-            "substeps": 5,
-        },
         "state_box": {
             "phi": {"low": -8, "high": 8, "cells": 64},
             "omega": {"low": -10, "high": 10, "cells": 64},

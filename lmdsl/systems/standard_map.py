@@ -21,9 +21,7 @@ class StandardMap(NamedMap):
         "Physica D 189 (2004) 234-246"
     )
     problem = {
-        "format": "lmdsl/1",
         "name": "standard map, period-two orbit",
-        "system": {"kind": "standard_map", "parameters": {"K": 0.25}},
         "state_box": {
             "x": {"low": 0, "high": 1, "cells": 50, "periodic": True},
             "y": {"low": 0, "high": 1, "cells": 50, "periodic": True},

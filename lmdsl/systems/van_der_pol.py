@@ -26,14 +26,7 @@ class VanDerPol(NamedOde):
         "Philosophical Magazine and Journal of Science, series 7, 2 (1926) 978-992"
     )
     problem: ClassVar = {
-        "format": "lmdsl/1",
         "name": "van der Pol oscillator, to rest",
-        "system": {
-            "kind": "van_der_pol",
-            "parameters": {"mu": 1},
-            "step": 0.2,
-            "substeps": 4,
-        },
         "state_box": {
             "x": {"low": -3, "high": 3, "cells": 60},
             "v": {"low": -4, "high": 4, "cells": 60},

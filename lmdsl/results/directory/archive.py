@@ -104,10 +104,10 @@ def _contents(result: Result) -> dict[str, bytes]:
 
 
 def _certificate(result: Result) -> dict[str, Any]:
-    proof, beyond = result.certificate, result.beyond_gamma
+    proof = result.certificate
     apart = {
         "format": FORMAT,
-        "beyond_gamma": beyond and beyond.to_dict(),
+        "beyond_gamma": result.beyond_gamma,
         "claims": {claim.name: getattr(proof, claim.name) for claim in CLAIMS},
         "measure_residual": proof.measure_residual,
         "reasons": proof.reasons,

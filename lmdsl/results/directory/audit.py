@@ -65,8 +65,7 @@ def differences(
         reasons.append("reasons are stored, but the status is verified")
     if result.status != Status.NOT_STABILIZABLE and result.cause is not None:
         reasons.append(f"cause is stored as {result.cause!r}, but nothing was refused")
-    area = result.beyond_gamma
-    beyond = jsonable(area.to_dict()) if area is not None else None
+    beyond = jsonable(result.beyond_gamma)
     if "beyond_gamma" in certificate.model_fields_set and certificate.beyond_gamma != beyond:
         reasons.append("beyond_gamma is not the cells that solution.npz names")
     if certificate.scope != SCOPE:
