@@ -248,7 +248,7 @@ def explain(
     else:
         partition = Partition.of(problem)
         assembled = assemble(problem, partition, progress, deadline)
-        status = _status(partition, assembled, deadline)
+        status = _status(assembled, deadline)
     if phase_one and assembled is None:
         assembled = assemble(problem, partition, progress, deadline)
     if progress:
@@ -286,15 +286,13 @@ def phase_one(problem: Problem, time_limit: float | Deadline | None = None) -> P
     """
     partition, deadline = Partition.of(problem), Deadline.of(time_limit)
     assembled = assemble(problem, partition, deadline=deadline)
-    status = _status(partition, assembled, deadline)
+    status = _status(assembled, deadline)
     return PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
 
 
-def _status(partition: Partition, transitions: Transitions, deadline: Deadline) -> Statuses:
+def _status(transitions: Transitions, deadline: Deadline) -> Statuses:
     """Return the status of every cell, shape (N,)."""
     found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
-    status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)
-    status[transitions.sets.free] = stabilizable_set.causes(found, transitions.pair_pointer)
-    status[transitions.sets.attractor] = CellStatus.ATTRACTOR
+    status = stabilizable_set.statuses(transitions, found)
     status.setflags(write=False)
     return status

@@ -34,42 +34,17 @@ import numpy as np
 
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.operations import _COMPARISONS, FORMULA_CONSTANTS, FORMULA_FUNCTIONS, OPERATIONS
+from lmdsl.formulas.tokens import Token, fault_at, scan
 
 MAX_CHARACTERS: Final = 4_000
 MAX_NODES: Final = 1_000
 MAX_DEPTH: Final = 50
 MAX_NAME: Final = 64
 
-
-"""Every function of the language and its number of arguments."""
-
 _COMPARE, _SUM, _PRODUCT, _POWER = 1, 2, 3, 4
 _RANK: Final = dict.fromkeys(_COMPARISONS, _COMPARE) | dict(
     zip(("+", "-", "*", "/", "**"), (_SUM, _SUM, _PRODUCT, _PRODUCT, _POWER), strict=True)
 )
-_TOKEN: Final = re.compile(
-    r"(?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)"
-    r"|(?P<name>[A-Za-z_][A-Za-z0-9_]*)|(?P<symbol>\*\*|<=|>=|==|!=|[-+*/(),<>])"
-)
-_NUMBER_TAIL: Final = re.compile(r"[0-9A-Za-z_.]+")
-
-
-class FormulaError(BadInput):
-    """A formula that is refused.
-
-    Parameters
-    ----------
-    message
-        One line that starts with ``character N:``, N counted from 1.
-    position
-        The same place counted from 0.
-    where
-        The path of the field that holds the formula.
-    """
-
-    def __init__(self, message: str, position: int = 0, where: str = "") -> None:
-        self.position = position
-        super().__init__(message, where)
 
 
 class Subformula(NamedTuple):
@@ -136,25 +111,15 @@ def parse(text: str, names: Collection[str]) -> Formula:
     """
     if len(text) > MAX_CHARACTERS:
         fault = f"the formula goes on to {len(text):,} characters; the limit is {MAX_CHARACTERS:,}"
-        raise _error(MAX_CHARACTERS, fault)
+        raise fault_at(MAX_CHARACTERS, fault)
     parts = _Parser(text, names).subformulas
     return Formula(text, frozenset(part.name for part in parts if part.name), tuple(parts))
-
-
-def _error(position: int, fault: str) -> FormulaError:
-    return FormulaError(f"character {position + 1}: {fault}", position)
 
 
 def fold(operation: str, values: Sequence[float]) -> float:
     """Apply an operation to constants with the very function that arrays go through."""
     with np.errstate(all="ignore"):
         return float(OPERATIONS[operation](*values))
-
-
-class _Token(NamedTuple):
-    kind: str  # number, name, symbol or end
-    text: str
-    start: int
 
 
 class _Parsed(NamedTuple):
@@ -175,70 +140,46 @@ class _Parser:
         self.subformulas: list[Subformula] = []
         self.nodes = self.depth = 0
         self.stop = 0  # end of the last token consumed
-        self.token = self._scan()
+        self.token = scan(self.text, self.stop)
         if self.token.kind == "end":
-            raise _error(0, "the formula is empty; write an expression such as 0 or 2*pi")
+            raise fault_at(0, "the formula is empty; write an expression such as 0 or 2*pi")
         root = self._expression(_COMPARE)
         if self.token.kind != "end":
             self._unexpected("an operator")
         self._require_values([root])
 
-    def _scan(self) -> _Token:
-        start = self.stop
-        while self.text[start : start + 1] in (" ", "\t"):
-            start += 1
-        if start == len(self.text):
-            return _Token("end", "", start)
-        match = _TOKEN.match(self.text, start)
-        if match is None:
-            hint = "; write ** for powers" if self.text[start] == "^" else ""
-            what = f"{shown(self.text[start])} is not part of the formula language"
-            raise _error(start, what + hint)
-        kind, text = str(match.lastgroup), match.group()
-        if kind == "name" and keyword.iskeyword(text):
-            raise _error(start, f"{shown(text)} is a Python keyword, not part of formulas")
-        if kind == "number":
-            tail = _NUMBER_TAIL.match(self.text, match.end())
-            if tail or re.fullmatch("0+[1-9][0-9]*", text):
-                number = shown(self.text[start : tail.end() if tail else match.end()])
-                fix = "write one like 1.5e-3 or 7, and * for a product"
-                raise _error(start, f"{number} is not a decimal number; {fix}")
-            if math.isinf(float(text)):
-                raise _error(start, f"{shown(text)} is too large; numbers end at about 1.8e308")
-        return _Token(kind, text, start)
-
-    def _advance(self) -> _Token:
+    def _advance(self) -> Token:
         token = self.token
         self.stop = token.start + len(token.text)
-        self.token = self._scan()
+        self.token = scan(self.text, self.stop)
         return token
 
     def _unexpected(self, expected: str) -> NoReturn:
         kind, text, start = self.token
         if kind == "end":
-            raise _error(start, f"the formula ends where {expected} is expected")
+            raise fault_at(start, f"the formula ends where {expected} is expected")
         if (kind != "symbol" or text == "(") and expected.startswith("an operator"):
             fault = f"an operator is missing before {shown(text)}; write * for a product"
-            raise _error(start, fault)
-        raise _error(start, f"{shown(text)} stands where {expected} is expected")
+            raise fault_at(start, fault)
+        raise fault_at(start, f"{shown(text)} stands where {expected} is expected")
 
     def _require_values(self, nodes: Sequence[_Parsed]) -> None:
         for node in nodes:
             if node.comparison >= 0:
                 rule = "a comparison may only be the first argument of where"
-                raise _error(node.comparison, f"{rule}; write where(x < 1, a, b)")
+                raise fault_at(node.comparison, f"{rule}; write where(x < 1, a, b)")
 
     def _count(self, start: int) -> None:
         self.nodes += 1
         if self.nodes > MAX_NODES:
             fault = f"the formula has more than {MAX_NODES:,} numbers, names and operators"
-            raise _error(start, f"{fault}; shorten it")
+            raise fault_at(start, f"{fault}; shorten it")
 
     def _deeper(self, start: int) -> None:
         self.depth += 1
         if self.depth > MAX_DEPTH:
             fault = f"brackets, calls, signs and powers nest deeper than {MAX_DEPTH}"
-            raise _error(start, f"{fault}; shorten the formula")
+            raise fault_at(start, f"{fault}; shorten the formula")
 
     def _leaf(self, part: Subformula) -> _Parsed:
         start = self._advance().start
@@ -257,7 +198,7 @@ class _Parser:
         if constant is not None and not math.isfinite(constant):
             kind = "not a number" if math.isnan(constant) else "infinite"
             fault = f"{shown(self.text[start : self.stop])} is {kind}; constants must be finite"
-            raise _error(start, fault)
+            raise fault_at(start, fault)
         comparison = at if operation in _COMPARISONS else -1
         return _Parsed(len(self.subformulas) - 1, start, self.stop, constant, comparison)
 
@@ -267,7 +208,7 @@ class _Parser:
         while (rank := _RANK.get(self.token.text, 0)) >= lowest:
             _, operator, at = self._advance()
             if rank == _COMPARE and left.comparison >= 0:
-                raise _error(at, f"{shown(operator)} compares again; where takes one comparison")
+                raise fault_at(at, f"{shown(operator)} compares again; where takes one comparison")
             if rank == _POWER:
                 self._deeper(at)
                 right = self._expression(_POWER)  # the same rank: groups to the right
@@ -312,12 +253,12 @@ class _Parser:
             return self._leaf(Subformula("name", name=text))
         declared = ", ".join(sorted(self.names)[:20]) + ", ..." * (len(self.names) > 20)
         listed = f"declared names are {declared}" if declared else "no names are declared"
-        raise _error(start, f"{shown(text)} is not a declared name or function; {listed}")
+        raise fault_at(start, f"{shown(text)} is not a declared name or function; {listed}")
 
     def _call(self, name: str, start: int) -> _Parsed:
         self._advance()
         if self.token.text != "(":
-            raise _error(start, f"{shown(name)} is a function; give its arguments in brackets")
+            raise fault_at(start, f"{shown(name)} is a function; give its arguments in brackets")
         self._deeper(start)
         self._advance()
         arguments: list[_Parsed] = []
@@ -331,9 +272,9 @@ class _Parser:
         arity = FORMULA_FUNCTIONS[name]
         if len(arguments) != arity:
             wanted = f"{arity} argument{'s' if arity > 1 else ''}"
-            raise _error(start, f"{shown(name)} takes {wanted}, not {len(arguments)}")
+            raise fault_at(start, f"{shown(name)} takes {wanted}, not {len(arguments)}")
         if name == "where" and arguments[0].comparison < 0:
             condition = arguments[0]
             fault = f"{shown(self.text[condition.start : condition.stop])} is not a comparison"
-            raise _error(condition.start, f"{fault}; write where(x < 1, a, b)")
+            raise fault_at(condition.start, f"{fault}; write where(x < 1, a, b)")
         return self._apply(name, arguments, start, start)

@@ -21,10 +21,11 @@ from lmdsl.common.types import Floats, Progress
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
+from lmdsl.machine.kernels import fixed
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model import algorithm_1, stabilizable_set
-from lmdsl.model.algorithm_1 import Predecessors
-from lmdsl.model.assembly.transitions import assemble, require_least, unless_short
+from lmdsl.model.assembly.estimates import require_least, unless_short
+from lmdsl.model.assembly.transitions import assemble
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.grid.partition import Partition
@@ -198,9 +199,8 @@ class StabilizationLP(Frozen):
     @property
     def tree(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""
-        level, policy = self._algorithm_1[0].view(), self._algorithm_1[1].view()
-        freeze(level, policy)
-        return level, policy
+        level, policy = self._algorithm_1
+        return fixed(level), fixed(policy)
 
     @cached_property
     def _algorithm_1(self) -> Levels:
@@ -218,9 +218,9 @@ class StabilizationLP(Frozen):
         return Directions(self.cells, self.partition.shape)
 
     @cached_property
-    def _predecessors(self) -> Predecessors:
+    def _predecessors(self) -> algorithm_1.Predecessors:
         """Columns that can reach each cell."""
-        return Predecessors.of(self.rows)
+        return algorithm_1.Predecessors.of(self.rows)
 
     @cached_property
     def digest(self) -> str:
@@ -229,16 +229,10 @@ class StabilizationLP(Frozen):
         sha.update(repr((self.rows.shares.total, [*self.rows.shares.numerator])).encode())
         sha.update(np.array([self.gamma], dtype="<f8").tobytes())
         for array, kind in (
-            (self.cell_status, "<u1"),
-            (self.pair_pointer, "<i8"),
-            (self.control, "<i4"),
-            (self.rows.pointer, "<i8"),
-            (self.rows.target, "<i4"),
-            (self.rows.code, "<u4"),
-            (self.cost, "<f8"),
-            (self.weight, "<f8"),
-            (self.controls, "<f8"),
-        ):
+            (self.cell_status, "<u1"), (self.pair_pointer, "<i8"), (self.control, "<i4"),
+            (self.rows.pointer, "<i8"), (self.rows.target, "<i4"), (self.rows.code, "<u4"),
+            (self.cost, "<f8"), (self.weight, "<f8"), (self.controls, "<f8"),
+        ):  # fmt: skip
             for part in np.array_split(array.ravel(), max(1, array.size // 2**22)):
                 sha.update(np.ascontiguousarray(part, dtype=kind).tobytes())
         return sha.hexdigest()
@@ -263,10 +257,8 @@ class StabilizationLP(Frozen):
         export_mps(self, inputs.path(path))
 
     def __repr__(self) -> str:
-        return (
-            f"StabilizationLP({self.n} rows, {self.K} columns, {len(self.rows.target)} transitions,"
-            f" gamma={self.gamma!r})"
-        )
+        sizes = f"{self.n} rows, {self.K} columns, {len(self.rows.target)} transitions"
+        return f"StabilizationLP({sizes}, gamma={self.gamma!r})"
 
 
 @own_arithmetic
@@ -304,9 +296,6 @@ def compile(  # noqa: A001
     sets = transitions.sets
     found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
     kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
-    status = np.full(partition.size, CellStatus.AVOID, dtype=np.uint8)
-    status[sets.free] = stabilizable_set.causes(found, transitions.pair_pointer)
-    status[sets.attractor] = CellStatus.ATTRACTOR
     cells = sets.free[found.inside]
     # The search that found C ends with Algorithm 1 on the surviving pairs.
     policy = found.pair[found.inside]
@@ -315,7 +304,7 @@ def compile(  # noqa: A001
         problem=problem,
         partition=partition,
         controls=control_vectors(problem),
-        cell_status=status,
+        cell_status=stabilizable_set.statuses(transitions, found),
         cells=cells,
         pair_pointer=pair_pointer,
         control=transitions.control[kept],
@@ -325,7 +314,6 @@ def compile(  # noqa: A001
         weight=sets.weight(cells),
         _known=(found.level[found.inside], column),
     )
-    for array in (lp.controls, lp.control, lp.cost):  # views
-        if isinstance(array.base, np.ndarray):
-            freeze(array.base)
+    views = (lp.controls, lp.control, lp.cost)
+    freeze(*(view.base for view in views if isinstance(view.base, np.ndarray)))
     return lp

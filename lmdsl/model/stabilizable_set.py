@@ -93,12 +93,15 @@ def stabilizable(
         _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)
 
 
-def causes(found: Stabilizable, pair_pointer: Indices) -> Statuses:
-    """Return the status code of every free cell (see :class:`CellStatus`), shape (F,)."""
-    status = np.full(len(found.inside), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
-    status[~found.reaches] = CellStatus.TRAPPED
-    status[np.diff(pair_pointer) == 0] = CellStatus.ESCAPES
-    status[found.inside] = CellStatus.STABILIZED
+def statuses(transitions: Transitions, found: Stabilizable) -> Statuses:
+    """Return the status code of every cell (see :class:`CellStatus`), shape (N,)."""
+    free = np.full(len(found.inside), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
+    free[~found.reaches] = CellStatus.TRAPPED
+    free[np.diff(transitions.pair_pointer) == 0] = CellStatus.ESCAPES
+    free[found.inside] = CellStatus.STABILIZED
+    status = np.full(len(transitions.sets.number), CellStatus.AVOID, dtype=np.uint8)
+    status[transitions.sets.free] = free
+    status[transitions.sets.attractor] = CellStatus.ATTRACTOR
     return status
 
 

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from lmdsl.common import inputs
 from lmdsl.common.types import Floats, Indices
-from lmdsl.control.simulation import draw_starts
+from lmdsl.control.loop import draw_starts
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.model.discretization import control_values, noise_nodes

@@ -17,7 +17,8 @@ from lmdsl.common.frozen import freeze
 from lmdsl.common.json_values import Reported
 from lmdsl.common.types import Bools, Floats, Statuses
 from lmdsl.control.controller import Controller
-from lmdsl.control.simulation import ClosedLoop, Simulation, simulate
+from lmdsl.control.loop import ClosedLoop
+from lmdsl.control.simulation import Simulation, simulate
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property

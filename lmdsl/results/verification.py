@@ -21,7 +21,7 @@ from lmdsl.errors import BadInput, printable
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.model.assembly.transitions import estimate
+from lmdsl.model.assembly.estimates import estimate
 from lmdsl.model.discretization import noise_nodes, sample_points
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.rows import Rows, Shares

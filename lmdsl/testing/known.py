@@ -195,3 +195,13 @@ def _data(
         "sampling": {"kind": "grid", "per_axis": per_axis},
         "gamma": gamma,
     }
+
+
+BY_HAND = (
+    *(single(gamma) for gamma in (0.9, 1.0, 1.5)),
+    *(choice(gamma) for gamma in (1.0, 1.5, 3.0)),
+    *(steps(2, gamma) for gamma in (0.5, 1.0, 1.25)),
+    walk(60),
+)
+LARGE = walk(1000)
+SMALL = steps(3, 1.25)

@@ -49,6 +49,11 @@ class Probe:
     malformed: list[str] = field(default_factory=list)
     answers: dict[str, Solution] = field(default_factory=dict)
 
+    def needs(self, capability: str) -> None:
+        """Leave a check unjudged that asks for what the record does not promise."""
+        if not getattr(self.backend.capabilities, capability):
+            raise Unjudged(f"the record says {capability}=False")
+
     def ask(self, lp: StabilizationLP, **options: Any) -> Solution:
         """Return a well-formed solution.
 

@@ -16,7 +16,8 @@ from lmdsl.backends import Backend, Capabilities, Solution, Stop, get, installed
 from lmdsl.backends.policy_iteration import solve as howard
 from lmdsl.optimize.policies.evaluation import evaluate
 from lmdsl.testing import Check, ContractFailure, Report, check_backend, known
-from lmdsl.testing.checks import BY_HAND, CHECKS, LARGE
+from lmdsl.testing.checks import CHECKS
+from lmdsl.testing.known import BY_HAND, LARGE
 from lmdsl.testing.probe import judge
 
 SPECS = [

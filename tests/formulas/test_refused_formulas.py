@@ -14,12 +14,8 @@ from hypothesis import strategies as st
 from spent import at_most
 
 from lmdsl.errors import BadInput
-from lmdsl.formulas.language import (
-    Formula,
-    FormulaError,
-    check_name,
-    parse,
-)
+from lmdsl.formulas.language import Formula, check_name, parse
+from lmdsl.formulas.tokens import FormulaError
 
 # Refusals.
 HOSTILE = [

@@ -8,11 +8,9 @@ import math
 import numpy as np
 import pytest
 
-from lmdsl.formulas.language import (
-    FormulaError,
-    parse,
-)
+from lmdsl.formulas.language import parse
 from lmdsl.formulas.program import Program
+from lmdsl.formulas.tokens import FormulaError
 
 NAMES = ("u", "x", "y")
 UFUNCS = {

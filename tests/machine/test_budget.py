@@ -19,7 +19,7 @@ from lmdsl.formulas.language import parse
 from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
 from lmdsl.model import discretization
-from lmdsl.model.assembly.transitions import estimate
+from lmdsl.model.assembly.estimates import estimate
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 

@@ -15,7 +15,7 @@ import lmdsl as lm
 from lmdsl.cli import main
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.threads import in_order
-from lmdsl.model.assembly.transitions import SHORT
+from lmdsl.model.assembly.estimates import SHORT
 from lmdsl.model.lp import compile
 from lmdsl.optimize import witness
 from lmdsl.results import solving
@@ -97,7 +97,7 @@ def test_it_ends_within_a_block(monkeypatch, threads):
 def test_what_compiles_in_a_moment_is_compiled(monkeypatch):
     lp = lm.compile(made(standard_map(20)), time_limit=1e-9)
     assert lp.digest == lm.compile(made(standard_map(20))).digest
-    monkeypatch.setattr("lmdsl.model.assembly.transitions.SHORT", 0)
+    monkeypatch.setattr("lmdsl.model.assembly.estimates.SHORT", 0)
     with pytest.raises(TimeLimitReached):
         lm.compile(made(standard_map(20)), time_limit=1e-9)
     assert SHORT > 0
@@ -112,7 +112,7 @@ def test_a_python_function_is_no_moment():
 
 def test_an_interrupt_ends_the_threads_that_help(monkeypatch):
     monkeypatch.setattr("lmdsl.machine.threads.count", lambda: 2)
-    monkeypatch.setattr("lmdsl.model.assembly.transitions.SHORT", 0)
+    monkeypatch.setattr("lmdsl.model.assembly.estimates.SHORT", 0)
     deadline = Deadline()
 
     def interrupt(stage, done):

@@ -12,7 +12,7 @@ from problems import made, standard_map, steps
 import lmdsl as lm
 from lmdsl.cli import main
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
-from lmdsl.model.assembly.transitions import unless_short
+from lmdsl.model.assembly.estimates import unless_short
 from lmdsl.model.lp import compile
 
 # What is long, though there are few cells, or before there are samples ------------------------
@@ -102,7 +102,7 @@ def test_many_samples_are_sorted_to_the_same_rows(monkeypatch):
 @pytest.fixture
 def saved(tmp_path, monkeypatch):
     """A result that takes more than a moment to make anew."""
-    monkeypatch.setattr("lmdsl.model.assembly.transitions.SHORT", 0)
+    monkeypatch.setattr("lmdsl.model.assembly.estimates.SHORT", 0)
     lm.solve(made(standard_map(20))).save(tmp_path / "out")
     return str(tmp_path / "out")
 

@@ -8,7 +8,7 @@ from random_problems import random_problem
 import lmdsl as lm
 from lmdsl.formulas.language import parse
 from lmdsl.formulas.program import Program
-from lmdsl.model.assembly import lines, sampler
+from lmdsl.model.assembly import lines, sampler, tape
 from lmdsl.model.assembly.lines import Lines
 from lmdsl.model.assembly.sampler import Sampler
 from lmdsl.model.grid.partition import Partition
@@ -104,7 +104,7 @@ def test_short_lines_are_left_to_numpy(monkeypatch):
     problem = lm.Problem.model_validate(dict(lm.systems.NAMED["lorenz"].problem))
     drawn, free = sampled(problem)
     assert drawn._images is not None
-    monkeypatch.setattr(lines, "_run", None)  # what is not called may be missing
+    monkeypatch.setattr(lines, "run", None)  # what is not called may be missing
     block = next(drawn.blocks(free[:20]))
     assert block.shape[1] < sampler.LEAST_LINE
     drawn.outcomes(block)
@@ -151,20 +151,20 @@ def test_the_kernel_against_a_plain_reference():
         arrays = [
             rng.normal(size=tuple(k if rng.random() < 0.6 else 1 for k in shape)) for _ in range(3)
         ]
-        rows, tape = [*(np.broadcast_to(a, shape) for a in arrays), np.full(shape, 0.7)], []
+        rows, steps = [*(np.broadcast_to(a, shape) for a in arrays), np.full(shape, 0.7)], []
         for _ in range(12):
             code, a, b = (int(k) for k in rng.integers(0, (9, len(rows), len(rows))))
-            tape.append((code, a, b, len(rows)))
+            steps.append((code, a, b, len(rows)))
             with np.errstate(all="ignore"):
                 rows.append(plain[code](rows[a], rows[b]) if code < 4 else plain[code](rows[a]))
         cost, weights = np.abs(rows[-1]), rng.random(shape[2])
         mean = np.zeros((shape[0], shape[3]))
-        tape.append((lines.ABS, len(rows) - 1, len(rows) - 1, len(rows)))
-        lines._run(
+        steps.append((tape.ABS, len(rows) - 1, len(rows) - 1, len(rows)))
+        tape.run(
             int(rng.choice([512, 7])),
-            lines.Tape(np.array(tape), np.array([0.7]), 3, len(rows) + 1),
-            lines._Inputs.of(arrays), shape,
-            lines.Located(np.empty(0, dtype=np.int64), np.empty((0, 6)), False),
+            tape.Tape(np.array(steps), np.array([0.7]), 3, len(rows) + 1),
+            tape.Inputs.of(arrays), shape,
+            tape.Located(np.empty(0, dtype=np.int64), np.empty((0, 6)), False),
             np.empty((0, 0, 0)), len(rows), weights, mean,
         )  # fmt: skip
         with np.errstate(all="ignore"):

@@ -194,7 +194,7 @@ def test_no_file_is_too_long():
     long = {
         name: n
         for name, path in house.modules(PACKAGE).items()
-        if (n := len(path.read_text().splitlines())) > 500
+        if (n := len(path.read_text().splitlines())) > 320
     }
     assert not long
 

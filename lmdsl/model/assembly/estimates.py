@@ -1,0 +1,118 @@
+"""What compiling and solving take, said before: bytes, and whether it is a moment's work."""
+
+import math
+from typing import NamedTuple
+
+from lmdsl.formulas.program import Program
+from lmdsl.machine import memory, threads
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model import discretization
+from lmdsl.model.assembly.sampler import CHUNK
+from lmdsl.problem.problem import Problem
+
+
+def require_least(problem: Problem) -> None:
+    """Refuse a problem whose grids and cells do not fit, before anything of it is made."""
+    memory.require(estimate(problem), "at least, before sampling")
+
+
+class Pilot(NamedTuple):
+    """What a few cells say of all: the share of admissible pairs and the mean length of rows."""
+
+    admissible: float = 1.0
+    entries: float = 1.0
+
+
+ALL_ADMISSIBLE = Pilot()
+
+
+def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
+    """Return an upper bound of the bytes that compiling and solving a problem takes.
+
+    Solving is counted for the default backend, as it goes as a rule. What takes more (cells that
+    are lost, ties, other backends, a first policy that is hard to find) asks when it comes to it.
+    """
+    # Capped: a stranger's product of counts may exceed the range of doubles.
+    N = min(math.prod(axis.cells for axis in problem.state_box.values()), 10**40)
+    M = min(discretization.control_count(problem), 10**40)
+    S = min(discretization.sample_points(problem) * discretization.node_count(problem), 10**40)
+    entry = 4 + (1 if S <= 2**8 else 2 if S <= 2**16 else 4)
+    pairs = M * pilot.admissible
+    # Of a pair the row, its end, control and cost; of a cell the sets, levels and weights.
+    model = N * (64 + pairs * (21 + pilot.entries * entry))
+    copied = (
+        pairs * (28 + pilot.entries * entry) if pilot.admissible < 1 else 0
+    )  # cells may be lost
+    # Of a pair whether it ties, and a unit cost; of a cell vectors, and the rows of a policy in
+    # doubles.
+    solving = pairs * 9 + 130 + 24 * pilot.entries
+    peak = MARGIN * (model + max(N * copied + _blocks(problem, S), N * solving))
+    return int(min(peak + _grids(problem, M, S) + OVERHEAD, 1e30))
+
+
+MARGIN = 1.1
+"""A few cells do not say exactly what all are like, and allocators keep something back."""
+
+
+OVERHEAD = 2**25
+"""Bytes of code, kernels and tables."""
+
+
+CODE = 250
+"""Bytes of a code of samples with noise: its exact numerator, of up to a thousand bits."""
+
+
+def _blocks(problem: Problem, S: int) -> int:
+    """Return the bytes of the blocks that are sampled at a time."""
+    step, cost = problem.step(), Program([problem.cost()], problem.system.constants())
+    d, samples, count = len(problem.state_box), max(CHUNK, S), threads.count()
+    # States, images and their cells, the arrays of a formula, keys and rows.
+    live = max(step.live, cost.live)
+    each = 8 * samples * (3 * d + live + 8)
+    waiting = 8 * (count - 1) * 16 * samples  # finished blocks, for their turn
+    return count * each + waiting
+
+
+def _grids(problem: Problem, M: int, S: int) -> int:
+    """Return the bytes of sample points, controls, noise nodes and codes."""
+    points, nodes = discretization.sample_points(problem), discretization.node_count(problem)
+    codes = S * (CODE if nodes > 1 else 16)
+    controls = M * 8 * (1 + 4 * len(problem.control_grid))
+    return controls + points * 40 * len(problem.state_box) + nodes * discretization.NODE + codes
+
+
+SHORT = 2e9
+"""Additions up to which compiling takes a moment, and is not ended for the time it takes."""
+
+
+SAMPLE = 40
+"""Additions that take as long as locating and sorting a sample."""
+
+
+CALL = 2_000
+"""Additions that take as long as NumPy's own work for an operation on an array."""
+
+
+SET = 20_000
+"""Additions that take as long as resolving a point or a box of a set, its cells apart."""
+
+
+def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
+    """Return a deadline, or one that never passes where compiling takes a moment at most."""
+    N = math.prod(axis.cells for axis in problem.state_box.values())
+    lanes = N * discretization.control_count(problem)
+    samples = discretization.sample_points(problem) * discretization.node_count(problem)
+    step, cost = problem.step(), Program([problem.cost()], problem.system.constants())
+    calls = 2 + 2 * lanes * min(samples, CHUNK) // CHUNK
+    work = lanes * samples * (SAMPLE + step.work + cost.work)
+    work += CALL * calls * (step.effort + cost.effort)
+    attractor, avoid, weight = problem.attractor, problem.avoid, problem.measure
+    boxes = [attractor.boxes, avoid.boxes if avoid else (), (weight and weight.boxes) or ()]
+    count = sum(map(len, boxes))
+    work += N * count + SET * (count + len(attractor.points) + len(attractor.cells))
+    density = problem.density()
+    if density is not None:
+        work += N * Program([density], problem.system.constants()).work
+    if problem.local_controller is not None:  # linearised: some fifty operations for each
+        work += 50 * CALL * step.effort
+    return Deadline() if work <= SHORT else deadline
