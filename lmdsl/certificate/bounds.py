@@ -33,11 +33,7 @@ def expected_above(lp: StabilizationLP, policy: Pairs, x: Floats, gamma: float) 
     """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
     upper, V = np.empty(lp.n), padded(x)
     above = _above if tame(lp, x, gamma) else _carefully_above
-
-    def part(cells: tuple[int, int]) -> None:
-        above(*cells, policy.view(np.uint64), lp.rows.kernel, gamma, V, upper)
-
-    over_cells(lp, part)
+    over_cells(lp, above, policy.view(np.uint64), lp.rows.kernel, gamma, V, upper)
     return upper
 
 
@@ -86,9 +82,9 @@ def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None)
     V = padded(x)
     cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
 
-    def part(cells: tuple[int, int]) -> tuple[int, Pairs]:
+    def part(first: int, last: int) -> tuple[int, Pairs]:
         found = np.empty(MAX_EXACT, dtype=np.int64)
-        given = (*cells, *lp._kernel, gamma, cost, V)
+        given = (first, last, *lp._kernel, gamma, cost, V)
         count, _, _ = _open(*given, found) if plain else _carefully(*given, NO_BOUNDS, found)
         return int(count), found[:count].copy()
 
@@ -138,15 +134,9 @@ def worst_excess(lp: StabilizationLP, V: Floats) -> tuple[float, bool]:
     r_a = max(0, V - lower bound of gamma P_a V - G_a), rounded up.
     """
     x, plain = padded(V), tame(lp, V, lp.gamma)
-
-    def part(cells: tuple[int, int]) -> tuple[float, bool]:
-        given = (*cells, *lp._kernel, lp.gamma, lp.cost, x)
-        room = (NO_PAIRS,) if plain else (NO_BOUNDS, NO_PAIRS)
-        _, worst, stuck = (_open if plain else _carefully)(*given, *room)
-        return float(worst), bool(stuck)
-
-    found = over_cells(lp, part)
-    return max(worst for worst, _ in found), any(stuck for _, stuck in found)
+    loop, room = (_open, (NO_PAIRS,)) if plain else (_carefully, (NO_BOUNDS, NO_PAIRS))
+    found = over_cells(lp, loop, *lp._kernel, lp.gamma, lp.cost, x, *room)
+    return float(max(worst for _, worst, _ in found)), any(stuck for *_, stuck in found)
 
 
 @kernel

@@ -1,7 +1,5 @@
 """What the commands share: one JSON object, a line of progress."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging
@@ -9,7 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, Self
 
 from lmdsl.cli.streams import say
 from lmdsl.errors import printable
@@ -18,7 +16,6 @@ Arguments = argparse.Namespace
 Run = Callable[[Arguments], int]
 Command = Callable[[str, Run, str], argparse.ArgumentParser]
 """Adds a command: its name, what runs it, its help."""
-
 
 SHARED: dict[str, dict[str, Any]] = {
     "file": {"metavar": "FILE", "help": "problem file"},
@@ -62,7 +59,7 @@ class ProgressLine:
         percent = f" {100 * fraction:3.0f} %" if fraction >= 0 else " ..."
         print(f"\r\x1b[K{stage}{percent}", end="", file=sys.stderr, flush=True)
 
-    def __enter__(self) -> ProgressLine:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

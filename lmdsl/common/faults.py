@@ -35,7 +35,6 @@ _FIXES = {
 }
 """What to do about each kind of fault that pydantic finds."""
 
-
 _ADD = "required key is missing; add it"
 
 

@@ -15,7 +15,6 @@ from lmdsl.errors import BadInput
 _K = TypeVar("_K")
 _V = TypeVar("_V")
 
-
 FROZEN = "declared objects are frozen; make a new one with problem.replaced(key=value)"
 
 
@@ -88,9 +87,7 @@ Seed = Annotated[int, Field(strict=True, ge=0, lt=2**63), BeforeValidator(plain)
 Numbers = Annotated[tuple[Number, ...], Field(fail_fast=True, min_length=1), BeforeValidator(plain)]
 """A sequence of finite doubles, at least one."""
 
-
 frozen_dict = AfterValidator(FrozenDict)
-
 
 LowHigh = Annotated[tuple[Number, Number], BeforeValidator(plain)]
 Box = Annotated[dict[str, LowHigh], BeforeValidator(plain), frozen_dict]

@@ -186,7 +186,6 @@ _SMOOTH: Final[dict[str, tuple[Extension, Extension]]] = {
     "sqrt": (_sqrt, lambda x: _one_over(iv.multiply(Interval.point(2.0), _sqrt(x)))),
 }
 
-
 _STEPS: Final = {"sign": np.sign, "floor": np.floor, "ceil": np.ceil, "rint": np.rint}
 _FUNCTION: Final = 2 * iv.FUNCTION_ULPS * iv.ROUNDING
 

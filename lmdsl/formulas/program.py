@@ -1,7 +1,5 @@
 """Evaluating formulas: several compiled together into one flat list of array operations."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -111,7 +109,7 @@ class Program:
             held -= sum(k not in inputs for k in instruction.released)
         return marked[::-1]
 
-    def part(self, outputs: Sequence[int]) -> Program:
+    def part(self, outputs: Sequence[int]) -> "Program":
         """Return the program that computes some of the slots, and nothing that they do not need."""
         part = copy.copy(self)
         part.outputs = list(outputs)

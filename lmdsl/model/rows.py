@@ -9,10 +9,10 @@ The last target, ``columns``, is the attractor: a vector multiplied with the row
 entry, 0 there. Every row sums to exactly 1 with it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,19 +128,11 @@ class Rows(Frozen):
         """Return some of the rows, in the given order."""
         chosen = np.ascontiguousarray(rows, dtype=np.int64).view(np.uint64)
         pointer = np.zeros(len(chosen) + 1, dtype=np.int64)
-        parts = spans(len(chosen))
-
-        def lengths(span: tuple[int, int]) -> None:
-            _lengths(*span, chosen, self.kernel.pointer, pointer[1:])
-
-        def copy(span: tuple[int, int]) -> None:
-            _take(*span, chosen, self.kernel, pointer, target, code)
-
-        threads.each(lengths, parts)
+        over_rows(len(chosen), _lengths, chosen, self.kernel.pointer, pointer[1:])
         np.cumsum(pointer, out=pointer)
         target = np.empty(int(pointer[-1]), dtype=np.int32)
         code = np.empty(int(pointer[-1]), dtype=self.code.dtype)
-        threads.each(copy, parts)
+        over_rows(len(chosen), _take, chosen, self.kernel, pointer, target, code)
         return Rows(pointer, target, code, self.shares, self.columns)
 
     def matrix(self, rows: NDArray[np.integer] | None = None):  # type: ignore[no-untyped-def]
@@ -166,9 +158,10 @@ class Rows(Frozen):
         return matrix
 
 
-def spans(count: int) -> list[tuple[int, int]]:
-    """Return the ranges into which so many rows are split for threads."""
-    return threads.ranges(count, PARTS if count >= MANY else 1)
+def over_rows(count: int, loop: Callable[..., object], *arguments: Any) -> None:
+    """Call ``loop(first, last, *arguments)`` on ranges of so many rows, in threads if it pays."""
+    ranges = threads.ranges(count, PARTS if count >= MANY else 1)
+    threads.each(lambda span: loop(*span, *arguments), ranges)
 
 
 @kernel

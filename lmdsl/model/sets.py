@@ -1,11 +1,10 @@
 """Which cells are attractor, avoid or free, and where the weight m may be positive."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from dataclasses import dataclass
 from functools import partial
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,9 +56,7 @@ class CellSets:
         return mass / total if total > 0 else np.zeros(len(cells))
 
     @classmethod
-    def of(
-        cls, problem: Problem, partition: Partition, deadline: Deadline | None = None
-    ) -> CellSets:
+    def of(cls, problem: Problem, partition: Partition, deadline: Deadline | None = None) -> Self:
         """Resolve the attractor, the avoid set and the weight of a problem.
 
         Raises

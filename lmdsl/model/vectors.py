@@ -1,7 +1,7 @@
 """Vectors over C as compiled loops read them, and work split over ranges of its cells."""
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,13 +21,11 @@ def padded(V: Floats) -> Floats:
 
 
 def over_cells(
-    lp: StabilizationLP, part: Callable[[tuple[int, int]], T], most: int = 16
+    lp: StabilizationLP, loop: Callable[..., T], *arguments: Any, most: int = 16
 ) -> list[T]:
-    """Call ``part`` on ranges of cells that cover C, in several threads where that pays.
+    """Call ``loop(first, last, *arguments)`` on ranges of cells that cover C, in threads or not.
 
     The ranges, ``most`` at most, do not depend on the number of threads; nor do the results.
     """
     count = max(1, min(len(lp.rows.target) // GRAIN, most, lp.n))
-    if count == 1:
-        return [part((0, lp.n))]
-    return threads.each(part, threads.ranges(lp.n, count))
+    return threads.each(lambda cells: loop(*cells, *arguments), threads.ranges(lp.n, count))

@@ -30,15 +30,8 @@ def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | No
         return least * (1 - terms * UNIT) * (1 - 4 * UNIT)
     lower, V = np.empty(lp.n), padded(x)
     cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
-
-    def part(cells: tuple[int, int]) -> None:
-        given = (*cells, *lp._kernel, gamma, cost, V, lower)
-        if plain:
-            _below(*given)
-        else:
-            _carefully(*given, NO_PAIRS)
-
-    over_cells(lp, part)
+    loop, room = (_below, ()) if plain else (_carefully, (NO_PAIRS,))
+    over_cells(lp, loop, *lp._kernel, gamma, cost, V, lower, *room)
     return lower
 
 

@@ -10,7 +10,7 @@ from lmdsl.certificate import bounds
 from lmdsl.common.types import Floats, Pairs, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.optimize.feasibility import least_radius, spectral_radius
+from lmdsl.optimize.feasibility import spectral_radius
 from lmdsl.optimize.feasibility.stopping import optimal_stopping
 from lmdsl.optimize.linear import equations
 from lmdsl.optimize.linear.gauss_seidel import TOLERANCE
@@ -20,7 +20,6 @@ from lmdsl.optimize.policies.iteration import iterate
 
 SWEEPS, MOST_ROUNDS = 30, 8
 """Sweeps after which a proof is given up unless they moved it much less than the ones before."""
-
 
 NEAR = 64
 """Largest level up to which a few passes from the levels may make a stabilizing policy."""
@@ -170,7 +169,7 @@ def _decided(lp: StabilizationLP, time_up: TimeUp) -> Feasible | Refused | Undec
     Then the last policy is stabilizing at gamma', and as a rule at gamma too. Else w is the proof
     against gamma; the slack absorbs rounding.
     """
-    best = least_radius.improved(lp, spectral_radius.short_lived(lp, time_up), time_up, lp.gamma)
+    best = spectral_radius.improved(lp, spectral_radius.short_lived(lp, time_up), time_up, lp.gamma)
     for slack in (1e-6, 1e-9, 1e-12, 0.0):
         if best.limit > lp.gamma:
             w, _ = stability_vector(lp, best.policy, time_up=time_up)

@@ -33,7 +33,7 @@ from lmdsl.machine.deadline import Deadline, Stopped
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.lp import StabilizationLP, compile
-from lmdsl.optimize.feasibility import least_radius, spectral_radius
+from lmdsl.optimize.feasibility import spectral_radius
 from lmdsl.optimize.feasibility.infeasible import (
     LEAST_WIDTH,
     WIDTH,
@@ -236,7 +236,7 @@ class _Search:
         """Narrow the bracket until it closes, or doubles decide no more."""
         best = start or spectral_radius.short_lived(self.lp, self.time_up)
         for _ in range(limit):
-            best = least_radius.improved(self.lp, best, self.time_up, least=0.01 * self.width)
+            best = spectral_radius.improved(self.lp, best, self.time_up, least=0.01 * self.width)
             self._raise_low(best)
             if self.time_up():
                 return

@@ -10,7 +10,7 @@ from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize import descent
-from lmdsl.optimize.feasibility import least_radius, spectral_radius, stopping
+from lmdsl.optimize.feasibility import spectral_radius, stopping
 from lmdsl.optimize.feasibility.spectral_radius import PolicyClasses
 from lmdsl.optimize.policies import evaluation, iteration
 
@@ -105,7 +105,7 @@ def _core(
     if needed is not None and needed <= most:
         return best.slow_vector, max(high, needed)
     # How far the controls can dodge these classes: they limit nothing if far enough.
-    alone = least_radius.improved(lp, best, time_up, most, inside=best.slowest)
+    alone = spectral_radius.improved(lp, best, time_up, most, inside=best.slowest)
     if alone.limit > most:
         return w_high, high
     answer = None

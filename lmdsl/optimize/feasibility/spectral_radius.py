@@ -5,11 +5,14 @@ vector close to its Perron vector by Noda's iteration; w is these vectors, each 
 flows in from the classes it leads to is smaller than the slack: a factor of at most 1/slack for
 each slow class on a way to A, and no more. So a chain of tens of equal slow classes, whose values
 grow over hundreds of decades, costs one pass.
+
+Howard's iteration raises the limit of a policy: the one of least spectral radius is best.
 """
 
 import math
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +20,7 @@ import numpy as np
 
 from lmdsl.certificate import bounds
 from lmdsl.common.types import Bools, Floats, Indices, Pairs, TimeUp, never
+from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.forking import cached_property
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility.perron import FINE, _perron, _scale
@@ -26,13 +30,11 @@ from lmdsl.optimize.policies import bellman, iteration
 TIED = 1e-6
 """Relative difference up to which two classes count as equally slow."""
 
-
 PASSES = 8
 """Passes over all pairs towards a policy from which runs last least."""
 
 HORIZON = 4
 """A policy should bring runs home within so many times the steps that it takes with luck."""
-
 
 ROUNDS, COARSE, SLIGHT = 100, 1e-2, 1e-10
 """Improvements of a policy at most; how well its first rates are known; a relative gain of none."""
@@ -190,3 +192,66 @@ def check_low(lp: StabilizationLP, policy: Pairs, w: Floats) -> float | None:
     with np.errstate(divide="ignore", over="ignore"):
         ratio = np.where(ahead > 0, np.minimum(w / ahead, sys.float_info.max), np.inf)
     return float(ratio.min()) * (1 - 4 * bounds.UNIT)
+
+
+def improved(
+    lp: StabilizationLP,
+    found: PolicyClasses,
+    time_up: TimeUp = never,
+    until: float = math.inf,
+    least: float = 1e-2 * TIED,
+    inside: Bools | None = None,
+) -> PolicyClasses:
+    """Raise the limit of a policy by Howard's policy iteration.
+
+    A control a with (P_a w)_i < (P_u w)_i keeps P_u w <= lam w, w > 0 being the vector that proves
+    the limit 1/lam: no step lowers it. While the limit still rises fast, the rates need not be
+    known well.
+
+    Parameters
+    ----------
+    lp, found, time_up
+        The model, a policy, and what ends the work.
+    until, least
+        A limit that is enough, and the relative gain of a step below which it is the last.
+    inside
+        As in :func:`of_policy`, of which ``found`` then comes.
+    """
+    enough = COARSE
+    with suppress(Stopped):
+        for _ in range(ROUNDS):
+            w = lifted(found)
+            if w is None or time_up() or found.limit > until:
+                break
+            new = _greedy(lp, found, w, enough, time_up, inside)
+            gain = 0.0 if new is None else new.limit / found.limit - 1
+            if new is not None and gain > 0:
+                found, enough = new, min(enough, max(FINE, 1e-2 * gain))
+            elif found.known <= FINE:
+                break
+            if gain < least and found.known > FINE:
+                found = of_policy(lp, found.policy, time_up, found.x, FINE, inside)
+            if 0 < gain < least:
+                break
+    return found
+
+
+def _greedy(
+    lp: StabilizationLP,
+    found: PolicyClasses,
+    w: Floats,
+    enough: float,
+    time_up: TimeUp,
+    inside: Bools | None,
+) -> PolicyClasses | None:
+    """Return the policy that is better for the w of another, None where none is."""
+    w = w if inside is None else np.where(inside, w, 0.0)
+    best = bellman.improve(lp, w, 1.0, np.zeros(lp.K))
+    change = best.value < (found.P @ w) * (1 - SLIGHT)
+    if not change.any():
+        return None
+    policy = np.where(change, best.policy, found.policy)
+    new = of_policy(lp, policy, time_up, found.x, enough, inside)
+    if new.limit <= found.limit * (1 + enough):
+        return of_policy(lp, policy, time_up, new.x, FINE, inside)
+    return new

@@ -3,10 +3,8 @@
 Staying put is summed up at once: x_i = (b_i + sum over j != i of M_ij x_j) / (1 - M_ii).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +57,7 @@ class SplitMatrix:
         return SplitArrays(self.begin, self.end, self.indices, self.data, self.inverse)
 
     @classmethod
-    def of(cls, M: Any) -> SplitMatrix:
+    def of(cls, M: Any) -> Self:
         """Split a CSR array."""
         n, entries = M.shape[0], len(M.data)
         end = np.empty(n, dtype=np.uint64)
@@ -69,7 +67,7 @@ class SplitMatrix:
         _split(M.indptr, M.indices, M.data, end, indices, data, inverse)
         return cls(begin, end, indices, data, inverse, Directions.line(n))
 
-    def transposed(self) -> SplitMatrix:
+    def transposed(self) -> "SplitMatrix":
         """Return the transposed matrix."""
         count = np.zeros(len(self.begin) + 1, dtype=np.uint64)
         _count(self.begin, self.end, self.indices, count)

@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.types import Indices, Pairs
-from lmdsl.machine import threads
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.rows import RowArrays, Rows, spans
+from lmdsl.model.rows import RowArrays, Rows, over_rows
 from lmdsl.optimize.linear.gauss_seidel import NEVER, SplitArrays, SplitMatrix
 
 
@@ -57,21 +56,13 @@ class Slots:
     def of(cls, rows: Rows, pair_pointer: Indices, gamma: float, directions: Directions) -> Self:
         """Make room for any policy, a pair of each cell's own."""
         capacity = np.empty(len(pair_pointer) - 1, dtype=np.int64)
-
-        def longest(span: tuple[int, int]) -> None:
-            _longest(*span, pair_pointer.view(np.uint64), rows.kernel.pointer, capacity)
-
-        threads.each(longest, spans(len(capacity)))
+        pairs = pair_pointer.view(np.uint64)
+        over_rows(len(capacity), _longest, pairs, rows.kernel.pointer, capacity)
         return cls(rows, capacity, gamma, directions)
 
     def system(self, chosen: Indices) -> SplitMatrix:
         """Return gamma P for one row of each cell; it holds until the next call."""
-        now = chosen.view(np.uint64)
-
-        def fill(span: tuple[int, int]) -> None:
-            _fill(*span, now, self.kernel)
-
-        threads.each(fill, spans(len(chosen)))
+        over_rows(len(chosen), _fill, chosen.view(np.uint64), self.kernel)
         return self.current
 
     @property

@@ -45,14 +45,9 @@ def improve(
         Other than the LP's own; ``cost`` has shape (K,).
     """
     value, policy = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
-    x = padded(V)
     gamma = lp.gamma if gamma is None else gamma
     cost = lp.cost if cost is None else cost
-
-    def part(cells: tuple[int, int]) -> None:
-        _improve(*cells, *lp._kernel, cost, gamma, x, value, policy)
-
-    over_cells(lp, part)
+    over_cells(lp, _improve, *lp._kernel, cost, gamma, padded(V), value, policy)
     return Improvement(value, policy)
 
 
@@ -71,22 +66,18 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
     value, policy = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
     x = padded(V)
 
-    def part(cells: tuple[int, int]) -> None:
+    def part(first: int, last: int) -> None:
         own = x.copy()  # the others keep the values from before
-        _rise(*cells, *lp._kernel, gamma, own, backwards, value, policy)
+        _rise(first, last, *lp._kernel, gamma, own, backwards, value, policy)
 
-    over_cells(lp, part, IN_PLACE)
+    over_cells(lp, part, most=IN_PLACE)
     return Improvement(value, policy)
 
 
 def below(lp: StabilizationLP, V: Floats, limit: Floats) -> Bools:
     """Return the columns with Q <= limit at V, shape (K,); ``limit`` has shape (n,)."""
-    found, x = np.empty(lp.K, dtype=np.bool_), padded(V)
-
-    def part(cells: tuple[int, int]) -> None:
-        _below(*cells, *lp._kernel, lp.cost, lp.gamma, x, limit, found)
-
-    over_cells(lp, part)
+    found = np.empty(lp.K, dtype=np.bool_)
+    over_cells(lp, _below, *lp._kernel, lp.cost, lp.gamma, padded(V), limit, found)
     return found
 
 

@@ -34,10 +34,8 @@ LEAST_SWEEPS, MOST_SWEEPS = 12, 60
 FEW = 500
 """Changes in fewer than one of so many cells: another pass costs less than evaluating them."""
 
-
 PATIENCE = 200
 """Sweeps in evaluations that did not come to their end before a Krylov method takes their place."""
-
 
 PROBES = 64
 """Rows looked at before all are."""

@@ -139,15 +139,15 @@ class Screen:
         found = Improved(value, new.view(np.uint64), self.policy_cost)
         pair_pointer, slots = lp._kernel[0], self.slots.kernel
 
-        def part(cells: tuple[int, int]) -> tuple[int, int]:
-            changed, looked = _pass(
-                *cells, pair_pointer, slots, self.cost, x.copy(), margin, backwards, rivals, found
-            )  # fmt: skip
-            return int(changed), int(looked)
+        def part(*cells: int) -> tuple[int, int]:
+            own = x.copy()
+            return _pass(  # type: ignore[no-any-return]
+                *cells, pair_pointer, slots, self.cost, own, margin, backwards, rivals, found
+            )
 
-        counts = vectors.over_cells(lp, part, bellman.IN_PLACE)
+        counts = vectors.over_cells(lp, part, most=bellman.IN_PLACE)
         self.policy = new
-        return Pass(value, new, sum(c for c, _ in counts), sum(k for _, k in counts))
+        return Pass(value, new, *(int(sum(each)) for each in zip(*counts, strict=True)))
 
     def tied(self, V: Floats, tolerance: float, policy: Pairs) -> tuple[Bools, Pairs, bool]:
         """Find the columns with Q <= Q_min + tolerance |Q_min| at V, and those of a policy.
@@ -173,11 +173,9 @@ class Screen:
         rivals = Rivals(policy.view(np.uint64), bound, self.scale)
         most = int(np.diff(lp.pair_pointer).max(initial=0))
 
-        def part(cells: tuple[int, int]) -> bool:
-            found = Tied(ties, first, np.empty(most))
-            return bool(
-                _ties(*cells, *lp._kernel, self.cost, self.gamma, x, tolerance, rivals, found)
-            )
+        def part(*cells: int) -> bool:
+            found, model = Tied(ties, first, np.empty(most)), (*lp._kernel, self.cost, self.gamma)
+            return bool(_ties(*cells, *model, x, tolerance, rivals, found))
 
         return ties, first, any(vectors.over_cells(lp, part))
 
