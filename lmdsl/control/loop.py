@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from lmdsl.common import inputs
-from lmdsl.common.types import Floats, Indices
+from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.control.controller import Controller
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
@@ -52,7 +52,7 @@ class Held:
 class ClosedLoop:
     """The true map under a controller: wraps, clips and judges like the compiled model."""
 
-    def __init__(self, problem: Problem, controller: Controller, status: NDArray[np.uint8]) -> None:
+    def __init__(self, problem: Problem, controller: Controller, status: Statuses) -> None:
         self.problem, self.controller, self.status = problem, controller, status
         self.partition = controller.partition
         self.true_map = TrueMap(problem, self.partition)
@@ -78,7 +78,7 @@ class ClosedLoop:
 
     def run(
         self, x: Floats, steps: int, rng: np.random.Generator, deadline: Deadline = FOREVER
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
+    ) -> tuple[Indices, Indices, Floats]:
         """Run from states until A, loss, the step limit, or the deadline.
 
         Returns

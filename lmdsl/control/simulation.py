@@ -1,7 +1,5 @@
 """The true map in closed loop: runs, and what became of them."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 from typing import Any
 

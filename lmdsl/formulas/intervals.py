@@ -7,8 +7,6 @@ the value. An operation that may be undefined somewhere on its operands (a logar
 number, a quotient across zero) returns the whole line: nothing is then claimed.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any, Final, NamedTuple
@@ -38,7 +36,7 @@ class Interval(NamedTuple):
     high: Any
 
     @staticmethod
-    def point(x: Any) -> Interval:
+    def point(x: Any) -> "Interval":
         """Return the degenerate interval of exact numbers."""
         array = np.asarray(x, dtype=np.float64)
         return Interval(array, array)

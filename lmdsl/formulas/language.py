@@ -21,8 +21,6 @@ depth 0, ``sin((-x))`` depth 3. A flat chain of ``+ -`` or ``* /`` adds none, ho
 Nothing is reordered or simplified, save that a power with the constant exponent 2 is a square.
 """
 
-from __future__ import annotations
-
 import keyword
 import math
 import re

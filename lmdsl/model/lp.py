@@ -5,8 +5,6 @@ Dual:  max m'V  s.t.  V[cell(k)] <= gamma (P V)[k] + G[k] for every surviving pa
 So ``A = (E - gamma P)'`` is (n, K), ``b = m``, ``c = G``; columns go by cell, then control.
 """
 
-from __future__ import annotations
-
 import hashlib
 import os
 from dataclasses import InitVar, dataclass, replace
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 
 from lmdsl.common import inputs
 from lmdsl.common.frozen import Frozen, freeze
-from lmdsl.common.types import Floats, Progress
+from lmdsl.common.types import Floats, Indices, Progress, Statuses
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
@@ -35,7 +33,7 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 
-Levels = tuple[NDArray[np.int32], NDArray[np.int64]]
+Levels = tuple[NDArray[np.int32], Indices]
 """Level and first stabilizing column of every cell."""
 
 
@@ -76,9 +74,9 @@ class StabilizationLP(Frozen):
     problem: Problem
     partition: Partition
     controls: Floats
-    cell_status: NDArray[np.uint8]
-    cells: NDArray[np.int64]
-    pair_pointer: NDArray[np.int64]
+    cell_status: Statuses
+    cells: Indices
+    pair_pointer: Indices
     control: NDArray[np.int32]
     rows: Rows
     cost: Floats
@@ -150,7 +148,7 @@ class StabilizationLP(Frozen):
         k = first + int(np.searchsorted(self.control[first:last], control))
         return int(k) if k < last and self.control[k] == control else None
 
-    def part(self, columns: NDArray[np.int64], inside: NDArray[np.int64]) -> StabilizationLP:
+    def part(self, columns: Indices, inside: Indices) -> "StabilizationLP":
         """Return the model on some cells and columns; every successor must lie inside or in A.
 
         Parameters
@@ -180,7 +178,7 @@ class StabilizationLP(Frozen):
             weight=self.weight[inside],
         )
 
-    def under(self, policy: NDArray[np.int64]) -> StabilizationLP:
+    def under(self, policy: Indices) -> "StabilizationLP":
         """Return the model under a policy, a column per cell: its only policy is ``arange(n)``."""
         policy = inputs.indices(policy, self.K, "policy", "columns")
         if (
@@ -197,7 +195,7 @@ class StabilizationLP(Frozen):
         )
 
     @property
-    def tree(self) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    def tree(self) -> tuple[NDArray[np.int32], Indices]:
         """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""
         level, policy = self._algorithm_1
         return fixed(level), fixed(policy)

@@ -78,7 +78,7 @@ class RowArrays(NamedTuple):
     pointer: NDArray[np.uint64]
     target: NDArray[np.uint32]
     code: NDArray[np.unsignedinteger]
-    share: NDArray[np.float64]
+    share: Floats
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,15 +5,7 @@ import numpy as np
 from lmdsl.backends import Solution, Stop
 from lmdsl.common.types import Floats
 from lmdsl.testing import known
-from lmdsl.testing.probe import (
-    ACCURACY,
-    Broken,
-    Probe,
-    Unjudged,
-    cost_to_go,
-    judge,
-    owned,
-)
+from lmdsl.testing.probe import ACCURACY, Broken, Probe, Unjudged, cost_to_go, judge, owned
 
 OVER = (2.0, 2 + 2e-3, 3.0)
 

@@ -13,13 +13,7 @@ from lmdsl.errors import BadInput, LmdslError
 from lmdsl.machine import quiet
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.testing import known
-from lmdsl.testing.probe import (
-    Broken,
-    Probe,
-    Unjudged,
-    judge,
-    misshapen,
-)
+from lmdsl.testing.probe import Broken, Probe, Unjudged, judge, misshapen
 
 TIGHT = 1e-7
 

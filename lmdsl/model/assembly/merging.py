@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices
 from lmdsl.machine.kernels import ONE, kernel
 
 Array = NDArray[Any]
@@ -31,7 +31,7 @@ class Numbering(NamedTuple):
     target: NDArray[np.int32]
     group: Array
     bits: int
-    first_code: NDArray[np.int64]
+    first_code: Indices
 
 
 class BlockRows(NamedTuple):
@@ -47,10 +47,10 @@ class BlockRows(NamedTuple):
         The rows one after the other.
     """
 
-    per_cell: NDArray[np.int64]
+    per_cell: Indices
     control: NDArray[np.int32]
     cost: Floats
-    end: NDArray[np.int64]
+    end: Indices
     target: NDArray[np.int32]
     code: NDArray[np.uint32]
 

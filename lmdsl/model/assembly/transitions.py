@@ -9,15 +9,13 @@ Work goes in blocks of pairs: memory beyond the result is bounded. Blocks are co
 threads and appended in order, so the rows do not depend on the number of threads.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, Progress
+from lmdsl.common.types import Floats, Indices, Progress
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory, threads
 from lmdsl.machine.deadline import Deadline
@@ -49,7 +47,7 @@ class Transitions:
     """
 
     sets: CellSets
-    pair_pointer: NDArray[np.int64]
+    pair_pointer: Indices
     control: NDArray[np.int32]
     rows: Rows
     cost: Floats
@@ -132,7 +130,7 @@ def _assembled(
     )
 
 
-def outcome(sampler: Sampler, cell: int, control: int) -> NDArray[np.int64]:
+def outcome(sampler: Sampler, cell: int, control: int) -> Indices:
     """Return the image cell of every sample of one pair, -1 where it leaves, shape (S,)."""
     block = Block(0, np.array([cell]), (control, control + 1))
     index = sampler.images(block, sampler.values(block)).reshape(-1)
@@ -206,7 +204,7 @@ def _pilot(sampler: Sampler, sets: CellSets) -> Pilot:
     return Pilot(float(kept.mean()), float(lengths[kept].mean()) if kept.any() else 1.0)
 
 
-def _lengths(sampler: Sampler, sets: CellSets, block: Block) -> NDArray[np.int64]:
+def _lengths(sampler: Sampler, sets: CellSets, block: Block) -> Indices:
     """Return the number of targets of every pair of a block, 0 where inadmissible."""
     index = sampler.images(block, sampler.values(block))
     sampler.guard()
@@ -214,7 +212,7 @@ def _lengths(sampler: Sampler, sets: CellSets, block: Block) -> NDArray[np.int64
     target = sets.number[np.where(leaves, 0.0, index).astype(np.int64)]
     target[leaves] = -1
     rows = np.sort(target, axis=1)
-    lengths: NDArray[np.int64] = (np.diff(rows, axis=1) != 0).sum(axis=1) + 1
+    lengths: Indices = (np.diff(rows, axis=1) != 0).sum(axis=1) + 1
     return np.where(rows[:, 0] >= 0, lengths, 0).ravel()
 
 

@@ -9,8 +9,6 @@ control only where strictly better keeps every policy gamma-stabilizing, zeros i
 (docs/mathematics.md, Policy iteration).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
