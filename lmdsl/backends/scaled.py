@@ -32,26 +32,16 @@ ENTRY = 100
 
 @dataclass(frozen=True, eq=False)
 class ScaledLP:
-    """The scaled LP; its arrays are copies, so that no solver can touch the model's.
+    """The scaled LP; its arrays are copies, so that no solver can touch the model's."""
 
-    Attributes
-    ----------
-    A
-        (E - gamma P)', SciPy CSC, shape (n, K).
-    b, c
-        Right-hand side, shape (n,), and cost, shape (K,); largest entry 1, or all zero.
-    b_unit, c_unit
-        What 1 stands for in b and in c.
-    started
-        When work on it began.
-    """
-
-    A: Any
+    A: Any  # (E - gamma P)', SciPy CSC, shape (n, K)
+    # b, c: right-hand side, shape (n,), and cost, shape (K,); largest entry 1, or all zero
     b: Floats
     c: Floats
+    # b_unit, c_unit: what 1 stands for in b and in c
     b_unit: float
     c_unit: float
-    started: float = field(default_factory=time.monotonic)
+    started: float = field(default_factory=time.monotonic)  # when work on it began
 
     @classmethod
     def of(cls, lp: StabilizationLP) -> ScaledLP:

@@ -29,31 +29,18 @@ class About(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """A claim: an inequality between stored doubles (see claims.py).
+    """A claim: an inequality between stored doubles (see claims.py)."""
 
-    Attributes
-    ----------
-    name
-        The field of the certificate that says whether it holds.
-    about
-        What it speaks of; a claim of a policy is checked on the model under it.
-    vector
-        The field of the witness that proves it.
-    check, check_exactly
-        Whether a vector proves it, and its number: with bounds of rounding, and in rationals.
-    sentence
-        The reason it gives in a certificate: where it does not hold; a refusal, where it does.
-    number
-        The field of the certificate for its number.
-    """
-
-    name: str
-    about: About
-    vector: str
+    name: str  # the field of the certificate that says whether it holds
+    about: About  # what it speaks of; a claim of a policy is checked on the model under it
+    vector: str  # the field of the witness that proves it
+    # check, check_exactly: whether a vector proves it, and its number: with bounds of rounding, and
+    # in rationals
     check: Callable[[StabilizationLP, Pairs, Floats], Found]
     check_exactly: exact_checks.ExactCheck
+    # the reason it gives in a certificate: where it does not hold; a refusal, where it does
     sentence: Callable[[StabilizationLP, Pairs | None, float | None], str]
-    number: str | None = None
+    number: str | None = None  # the field of the certificate for its number
 
 
 def _stabilizing(lp: StabilizationLP, policy: Pairs, w: Floats) -> Found:

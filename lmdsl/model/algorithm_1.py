@@ -19,19 +19,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Predecessors:
-    """For every target, the pairs that can reach it: the transpose of the rows' pattern.
+    """For every target, the pairs that can reach it: the transpose of the rows' pattern."""
 
-    Attributes
-    ----------
-    pointer
-        Shape (columns + 2,): pairs that reach j are ``pair[pointer[j]:pointer[j + 1]]``; the
-        attractor is the last j.
-    pair
-        Pair indices, int32 (int64 where needed), ascending for each target.
-    """
-
+    # shape (columns + 2,): pairs that reach j are ``pair[pointer[j]:pointer[j + 1]]``; the
+    # attractor is the last j
     pointer: Indices
-    pair: NDArray[Any]
+    pair: NDArray[Any]  # pair indices, int32 (int64 where needed), ascending for each target
 
     @classmethod
     def of(cls, rows: Rows) -> Predecessors:

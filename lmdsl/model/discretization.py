@@ -56,21 +56,13 @@ def control_range(problem: Problem) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, eq=False)
 class Nodes:
-    """The noise nodes of a problem.
+    """The noise nodes of a problem."""
 
-    Attributes
-    ----------
-    values
-        Shape (q, r): q nodes of r noise variables, C-order product; one node without noise.
-    weights
-        Shape (q,), > 0. Probabilities up to rounding: shares divide by their exact sum.
-    group
-        Shape (q,): nodes of equal weight share a group, numbered by first appearance.
-    """
-
+    # shape (q, r): q nodes of r noise variables, C-order product; one node without noise
     values: Floats
+    # shape (q,), > 0. Probabilities up to rounding: shares divide by their exact sum.
     weights: Floats
-    group: Indices
+    group: Indices  # shape (q,): nodes of equal weight share a group, numbered by first appearance
 
     def group_weights(self) -> list[float]:
         """Return the weight of each group."""

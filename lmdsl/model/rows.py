@@ -29,24 +29,12 @@ PARTS, MANY = 8, 10_000
 
 @dataclass(frozen=True, eq=False)
 class Shares(Frozen):
-    """What the codes of a set of rows stand for.
+    """What the codes of a set of rows stand for."""
 
-    Attributes
-    ----------
-    numerator
-        Exact integers, one per code.
-    total
-        Exact integer; ``numerator[code] / total`` is the exact share.
-    value
-        The same as doubles, shape (codes,), each correctly rounded.
-    merged
-        Every target occurs at most once in a row.
-    """
-
-    numerator: Sequence[int]
-    total: int
-    value: Floats
-    merged: bool = False
+    numerator: Sequence[int]  # exact integers, one per code
+    total: int  # exact integer; ``numerator[code] / total`` is the exact share
+    value: Floats  # the same as doubles, shape (codes,), each correctly rounded
+    merged: bool = False  # every target occurs at most once in a row
 
     @classmethod
     def of(cls, points: int, nodes: Nodes) -> Self:

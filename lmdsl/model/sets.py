@@ -26,24 +26,14 @@ PART = 2**16
 
 @dataclass(frozen=True, eq=False)
 class CellSets:
-    """Which cells are attractor (A), avoid (Z) or free (neither).
+    """Which cells are attractor (A), avoid (Z) or free (neither)."""
 
-    Attributes
-    ----------
-    attractor, avoid
-        Masks of shape (N,).
-    mass
-        Weight of every cell before it is intersected with C and scaled, shape (N,).
-    free
-        Indices of the cells outside A and Z, shape (F,), ascending.
-    number
-        Shape (N,), int32: position in ``free``; F for the attractor; -1 for avoid.
-    """
-
+    # attractor, avoid: masks of shape (N,)
     attractor: Bools
     avoid: Bools
-    mass: Floats
-    free: Indices
+    mass: Floats  # weight of every cell before it is intersected with C and scaled, shape (N,)
+    free: Indices  # indices of the cells outside A and Z, shape (F,), ascending
+    # shape (N,), int32: position in ``free``; F for the attractor; -1 for avoid
     number: NDArray[np.int32]
 
     def weight(self, cells: NDArray[np.integer]) -> Floats:

@@ -48,23 +48,12 @@ LOST = (CellStatus.ESCAPES, CellStatus.TRAPPED, CellStatus.LEADS_TO_THESE)
 
 @dataclass(frozen=True, eq=False)
 class Stabilizable:
-    """The stabilizable set of a set of transitions.
+    """The stabilizable set of a set of transitions."""
 
-    Attributes
-    ----------
-    inside
-        Which free cells lie in C, shape (F,).
-    surviving
-        Which pairs survive: cell in C, every successor in C u A, shape (pairs,).
-    reaches
-        Free cells from which A can be reached through admissible pairs, shape (F,).
-    level, pair
-        Algorithm 1 on the surviving pairs, see :func:`tree`; each of shape (F,).
-    """
-
-    inside: Bools
-    surviving: Bools
-    reaches: Bools
+    inside: Bools  # which free cells lie in C, shape (F,)
+    surviving: Bools  # which pairs survive: cell in C, every successor in C u A, shape (pairs,)
+    reaches: Bools  # free cells from which A can be reached through admissible pairs, shape (F,)
+    # level, pair: algorithm 1 on the surviving pairs, see :func:`tree`; each of shape (F,)
     level: NDArray[np.int32]
     pair: Indices
 

@@ -32,21 +32,11 @@ def number(value: float, digits: int = 3) -> str:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One or two axes of the partition, the others held at one cell.
+    """One or two axes of the partition, the others held at one cell."""
 
-    Attributes
-    ----------
-    partition
-        All cells.
-    axes
-        Positions of the axes shown.
-    cell
-        Multi-index of a cell in the slice, shape (d,).
-    """
-
-    partition: Partition
-    axes: tuple[int, ...]
-    cell: Indices
+    partition: Partition  # all cells
+    axes: tuple[int, ...]  # positions of the axes shown
+    cell: Indices  # multi-index of a cell in the slice, shape (d,)
 
     @classmethod
     def of(

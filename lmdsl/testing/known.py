@@ -19,21 +19,11 @@ from lmdsl.problem.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """A problem and its V.
+    """A problem and its V."""
 
-    Attributes
-    ----------
-    name
-        How reports call it.
-    data
-        The problem as plain data.
-    value
-        V derived by hand, shape (n,).
-    """
-
-    name: str
-    data: Mapping[str, Any]
-    value: Floats
+    name: str  # how reports call it
+    data: Mapping[str, Any]  # the problem as plain data
+    value: Floats  # V derived by hand, shape (n,)
 
     def compile(self) -> StabilizationLP:
         """Return the LP, made anew: what a backend did to another one is not in it."""
@@ -53,15 +43,9 @@ class Known:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Weighted(StabilizationLP):
-    """The same model, to be solved with another weight.
+    """The same model, to be solved with another weight."""
 
-    Attributes
-    ----------
-    other
-        The weight, positive, shape (n,).
-    """
-
-    other: Floats | None = None
+    other: Floats | None = None  # the weight, positive, shape (n,)
 
     @property
     def solve_weight(self) -> Floats:

@@ -32,21 +32,14 @@ class Unjudged(Exception):
 
 @dataclass
 class Probe:
-    """A backend with one of its algorithms.
+    """A backend with one of its algorithms."""
 
-    Attributes
-    ----------
-    backend, algorithm
-        Who is asked.
-    malformed
-        What was wrong with the form of its answers, whichever check asked.
-    answers
-        Its solutions without options, by the name of the LP.
-    """
-
+    # backend, algorithm: who is asked
     backend: Backend
     algorithm: str | None
+    # what was wrong with the form of its answers, whichever check asked
     malformed: list[str] = field(default_factory=list)
+    # its solutions without options, by the name of the LP
     answers: dict[str, Solution] = field(default_factory=dict)
 
     def needs(self, capability: str) -> None:

@@ -28,21 +28,12 @@ LEAST, MOST = 8, 1_000
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Formulas split into what NumPy evaluates and what is done line by line.
+    """Formulas split into what NumPy evaluates and what is done line by line."""
 
-    Attributes
-    ----------
-    early
-        The program of the small arrays: those outputs that are small, then the inputs of the rest.
-    varying
-        For each output its row among the lines, -1 where it is small.
-    tape
-        What is done line by line.
-    """
-
+    # the program of the small arrays: those outputs that are small, then the inputs of the rest
     early: Program
-    varying: tuple[int, ...]
-    tape: Tape
+    varying: tuple[int, ...]  # for each output its row among the lines, -1 where it is small
+    tape: Tape  # what is done line by line
 
     @classmethod
     def of(cls, program: Program, controls: Collection[str]) -> Self | None:

@@ -36,21 +36,11 @@ FEW = 16
 
 
 class Block(NamedTuple):
-    """Some cells, each with some controls.
+    """Some cells, each with some controls."""
 
-    Attributes
-    ----------
-    first
-        Position of the first cell among all cells asked for.
-    cells
-        Indices of the cells in the box.
-    controls
-        The first control and the one after the last.
-    """
-
-    first: int
-    cells: Indices
-    controls: tuple[int, int]
+    first: int  # position of the first cell among all cells asked for
+    cells: Indices  # indices of the cells in the box
+    controls: tuple[int, int]  # the first control and the one after the last
 
     @property
     def width(self) -> int:

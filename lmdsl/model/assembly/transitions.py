@@ -30,27 +30,14 @@ from lmdsl.problem.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """The admissible pairs of a problem, ordered by cell, then control.
+    """The admissible pairs of a problem, ordered by cell, then control."""
 
-    Attributes
-    ----------
-    sets
-        The cells outside A and Z, on which pairs are formed.
-    pair_pointer
-        Shape (F + 1,): pairs of the i-th free cell are ``pair_pointer[i]:pair_pointer[i + 1]``.
-    control
-        Control index of each pair, int32.
-    rows
-        One row per pair; targets number the free cells, F is the attractor.
-    cost
-        Weighted mean of the stage cost over the samples of each pair.
-    """
-
-    sets: CellSets
+    sets: CellSets  # the cells outside A and Z, on which pairs are formed
+    # shape (F + 1,): pairs of the i-th free cell are ``pair_pointer[i]:pair_pointer[i + 1]``
     pair_pointer: Indices
-    control: NDArray[np.int32]
-    rows: Rows
-    cost: Floats
+    control: NDArray[np.int32]  # control index of each pair, int32
+    rows: Rows  # one row per pair; targets number the free cells, F is the attractor
+    cost: Floats  # weighted mean of the stage cost over the samples of each pair
 
 
 MANY = CHUNK // 2

@@ -30,23 +30,13 @@ FEW = 4
 
 @dataclass(frozen=True, eq=False)
 class Directions:
-    """The orders of some cells of a box.
+    """The orders of some cells of a box."""
 
-    Attributes
-    ----------
-    cells
-        Their indices in the box, ascending, shape (n,).
-    shape
-        Cells per axis.
-    against
-        The combinations follow each other the other way round, as transposed systems want it.
-    whole, chosen
-        The cells of which these are some, and their positions there.
-    """
-
-    cells: NDArray[np.integer[Any]]
-    shape: tuple[int, ...]
+    cells: NDArray[np.integer[Any]]  # their indices in the box, ascending, shape (n,)
+    shape: tuple[int, ...]  # cells per axis
+    # the combinations follow each other the other way round, as transposed systems want it
     against: bool = False
+    # whole, chosen: the cells of which these are some, and their positions there
     whole: Directions | None = None
     chosen: NDArray[np.integer[Any]] | None = None
 

@@ -42,31 +42,17 @@ ROUNDS, COARSE, SLIGHT = 100, 1e-2, 1e-10
 
 @dataclass(frozen=True, eq=False)
 class PolicyClasses:
-    """A policy class by class.
+    """A policy class by class."""
 
-    Attributes
-    ----------
-    policy
-        A column per cell.
-    P
-        Its rows, CSR, shape (n, n).
-    order, ends
-        Its cells by class, every class after all it leads to: see ``linear.classes``.
-    x
-        A positive vector on every class, close to the Perron vector; shape (n,).
-    rate
-        Upper bound of the spectral radius of the class of every cell, up to rounding, shape (n,).
-    known
-        How well the largest rates are known, relative.
-    """
-
-    policy: Pairs
-    P: Any
+    policy: Pairs  # A column per cell
+    P: Any  # its rows, CSR, shape (n, n)
+    # order, ends: its cells by class, every class after all it leads to: see ``linear.classes``
     order: Indices
     ends: Indices
-    x: Floats
+    x: Floats  # A positive vector on every class, close to the Perron vector; shape (n,)
+    # upper bound of the spectral radius of the class of every cell, up to rounding, shape (n,)
     rate: Floats
-    known: float
+    known: float  # how well the largest rates are known, relative
 
     @property
     def limit(self) -> float:

@@ -16,24 +16,12 @@ LEAST_UNIT = 1e-140
 
 @dataclass(frozen=True, eq=False)
 class Stopping:
-    """The outcome of optimal stopping.
+    """The outcome of optimal stopping."""
 
-    Attributes
-    ----------
-    w
-        The greatest solution of w = min(reward, gamma min_a P_a w), shape (n,).
-    policy
-        A column for every cell; it counts where ``going``.
-    going
-        Cells that do not stop.
-    converged
-        False where rounding or the limit ended the work.
-    """
-
-    w: Floats
-    policy: Pairs
-    going: Bools
-    converged: bool
+    w: Floats  # the greatest solution of w = min(reward, gamma min_a P_a w), shape (n,)
+    policy: Pairs  # A column for every cell; it counts where ``going``
+    going: Bools  # cells that do not stop
+    converged: bool  # false where rounding or the limit ended the work
 
     @property
     def refuses(self) -> bool:

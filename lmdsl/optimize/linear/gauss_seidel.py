@@ -32,24 +32,15 @@ class SplitArrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SplitMatrix:
-    """A matrix M with its diagonal apart.
+    """A matrix M with its diagonal apart."""
 
-    Attributes
-    ----------
-    begin, end, indices, data
-        The rows of M without its diagonal: row i is ``begin[i]:end[i]``.
-    inverse
-        1 / (1 - M_ii), huge where M_ii >= 1: no finite x_i > 0 satisfies such a row.
-    directions
-        Orders in which sweeps visit the components.
-    """
-
+    # begin, end, indices, data: the rows of M without its diagonal: row i is ``begin[i]:end[i]``
     begin: NDArray[np.uint64]
     end: NDArray[np.uint64]
     indices: NDArray[np.uint32]
     data: Floats
-    inverse: Floats
-    directions: Directions
+    inverse: Floats  # 1 / (1 - M_ii), huge where M_ii >= 1: no finite x_i > 0 satisfies such a row
+    directions: Directions  # orders in which sweeps visit the components
 
     @property
     def kernel(self) -> SplitArrays:

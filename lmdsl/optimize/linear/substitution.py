@@ -35,27 +35,13 @@ FAR = np.uint64(8)
 
 @dataclass(frozen=True, eq=False)
 class Peeled:
-    """A system and its core.
+    """A system and its core."""
 
-    Attributes
-    ----------
-    system
-        The whole.
-    order
-        Cells outside the core, each before all it leads to.
-    levels
-        Where each level of ``order`` ends.
-    core
-        The other cells, ascending.
-    inner
-        The system on the core, its cells numbered as in ``core``.
-    """
-
-    system: SplitMatrix
-    order: CellNumbers
-    levels: Indices
-    core: CellNumbers
-    inner: SplitMatrix
+    system: SplitMatrix  # the whole
+    order: CellNumbers  # cells outside the core, each before all it leads to
+    levels: Indices  # where each level of ``order`` ends
+    core: CellNumbers  # the other cells, ascending
+    inner: SplitMatrix  # the system on the core, its cells numbered as in ``core``
 
     @classmethod
     def of(cls, system: SplitMatrix) -> Self:

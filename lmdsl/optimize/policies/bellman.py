@@ -18,18 +18,10 @@ IN_PLACE = 4
 
 @dataclass(frozen=True, eq=False)
 class Improvement:
-    """The result of one pass.
+    """The result of one pass."""
 
-    Attributes
-    ----------
-    value
-        (T V)_i, shape (n,).
-    policy
-        The first minimising column of every cell, shape (n,).
-    """
-
-    value: Floats
-    policy: Pairs
+    value: Floats  # (T V)_i, shape (n,)
+    policy: Pairs  # the first minimising column of every cell, shape (n,)
 
 
 def improve(

@@ -41,25 +41,14 @@ PROBES = 64
 
 @dataclass(frozen=True, eq=False)
 class Iteration:
-    """The outcome of policy iteration.
+    """The outcome of policy iteration."""
 
-    Attributes
-    ----------
-    policy, value
-        The last policy and its value.
-    steps
-        Improvement steps that changed the policy.
-    converged
-        False when stopped early.
-    screen
-        Lower bounds of the rivals of each cell's control at the value.
-    """
-
+    # policy, value: the last policy and its value
     policy: Pairs
     value: Floats
-    steps: int
-    converged: bool
-    screen: Screen
+    steps: int  # improvement steps that changed the policy
+    converged: bool  # false when stopped early
+    screen: Screen  # lower bounds of the rivals of each cell's control at the value
 
 
 def iterate(

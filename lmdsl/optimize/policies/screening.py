@@ -30,38 +30,19 @@ MOST = 1e308
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """The outcome of one pass.
+    """The outcome of one pass."""
 
-    Attributes
-    ----------
-    value
-        min(V, T V) where a control changed, min(V, T_u V) elsewhere, shape (n,).
-    policy
-        The policy after the pass, shape (n,).
-    changed
-        Number of cells whose control changed.
-    looked
-        Number of rows read.
-    """
-
-    value: Floats
-    policy: Pairs
-    changed: int
-    looked: int
+    value: Floats  # min(V, T V) where a control changed, min(V, T_u V) elsewhere, shape (n,)
+    policy: Pairs  # the policy after the pass, shape (n,)
+    changed: int  # number of cells whose control changed
+    looked: int  # number of rows read
 
 
 class Rivals(NamedTuple):
-    """The control of each cell and what is known of its rivals, as compiled loops use them.
+    """The control of each cell and what is known of its rivals, as compiled loops use them."""
 
-    Attributes
-    ----------
-    policy
-        A pair of each cell, shape (n,).
-    bound, scale
-        ``bound * scale`` is below the Q of every rival; shape (n,).
-    """
-
-    policy: NDArray[np.uint64]
+    policy: NDArray[np.uint64]  # A pair of each cell, shape (n,)
+    # bound, scale: ``bound * scale`` is below the Q of every rival; shape (n,)
     bound: Floats
     scale: float
 

@@ -171,21 +171,11 @@ def _model_arrays(lp: StabilizationLP) -> dict[str, NDArray[Any]]:
 
 @dataclass(frozen=True)
 class Stored:
-    """What a directory holds.
+    """What a directory holds."""
 
-    Attributes
-    ----------
-    result
-        The result, none of its claims checked.
-    certificate
-        Content of certificate.json.
-    rewritten
-        Files that are not as they were saved, and are no other save's.
-    """
-
-    result: Result
-    certificate: CertificateFile
-    rewritten: tuple[str, ...]
+    result: Result  # the result, none of its claims checked
+    certificate: CertificateFile  # content of certificate.json
+    rewritten: tuple[str, ...]  # files that are not as they were saved, and are no other save's
 
 
 def load(path: str | os.PathLike[str]) -> Result:
