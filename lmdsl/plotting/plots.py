@@ -97,13 +97,7 @@ def portrait(
         orbit = runs.open_loop(given, partition, first, u, steps or 60, fine=False)[:, 0, 0]
         overlays.graph(drawn, view, x, image, orbit)
         return drawn
-    side = starts or (8 if lines else 14)
-    grid = np.stack(np.meshgrid(*[np.arange(side)] * 2), axis=-1).reshape(-1, 2)
-    place = (grid + np.random.default_rng(0).random(grid.shape)) / side
-    first = np.tile(partition.low + (view.cell + 0.5) * partition.width, (len(place), 1))
-    shown_axes = list(view.axes)
-    span = (partition.high - partition.low)[shown_axes]
-    first[:, shown_axes] = partition.low[shown_axes] + place * span
+    first, place = runs.tiled(partition, view, starts or (8 if lines else 14))
     points = runs.open_loop(given, partition, first, u, steps or (60 if lines else 300), fine=lines)
     overlays.orbits(drawn, view, points, place[:, 1], lines)
     layers.outline(drawn, view, view.shadow(attractor), layers.ATTRACTOR, 1.6)

@@ -15,6 +15,7 @@ from lmdsl.model.discretization import control_values, noise_nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
+from lmdsl.plotting.view import View
 from lmdsl.problem.problem import Problem
 from lmdsl.results.result import Result
 from lmdsl.systems.base import OdeSystem
@@ -90,6 +91,20 @@ def open_loop(
         if not len(active):
             break
     return points
+
+
+def tiled(partition: Partition, view: View, side: int) -> tuple[Floats, Floats]:
+    """Return a state in each tile of a grid over the two axes shown, and its place there in 0..1.
+
+    Shapes (side^2, d) and (side^2, 2).
+    """
+    grid = np.stack(np.meshgrid(*[np.arange(side)] * 2), axis=-1).reshape(-1, 2)
+    place = (grid + np.random.default_rng(0).random(grid.shape)) / side
+    first = np.tile(partition.low + (view.cell + 0.5) * partition.width, (len(place), 1))
+    axes = list(view.axes)
+    span = (partition.high - partition.low)[axes]
+    first[:, axes] = partition.low[axes] + place * span
+    return first, place
 
 
 def starts_of(result: Result, starts: int | ArrayLike, seed: int) -> Floats:

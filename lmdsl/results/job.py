@@ -137,11 +137,7 @@ class _Job:
     def _result(
         self, witness: Witness, proof: Certificate, status: Status, message: str, **more: Any
     ) -> Result:
-        lp, n = self.lp, self.lp.n
-
-        def spread(values: Any, missing: float, attractor: float, outside: float) -> Any:
-            known = np.full(n, missing) if values is None else values
-            return lp.expand(np.asarray(known, dtype=np.float64), attractor, outside)
+        lp = self.lp
 
         w = witness.w if witness.refusal is None else witness.refusal
         index = np.full(lp.partition.size, -1, dtype=np.int32)
@@ -163,7 +159,7 @@ class _Job:
             controls=len(lp.controls),
             pairs=lp.K,
             attractor_cells=int(attractor.sum()),
-            stabilizable_cells=n,
+            stabilizable_cells=lp.n,
             local_controller=None if local is None else examine(lp.problem, local, self.finish),
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
             message=message,
@@ -171,12 +167,20 @@ class _Job:
             partition=lp.partition,
             certificate=proof,
             control_index=index,
-            value=spread(witness.V_up if proof.upper_bound else None, np.inf, 0.0, np.inf),
-            lower=spread(witness.W if proof.lower_bound else None, 0.0, 0.0, np.inf),
-            measure=spread(witness.mu, 0.0, 0.0, 0.0),
+            value=_spread(lp, witness.V_up if proof.upper_bound else None, np.inf, 0.0, np.inf),
+            lower=_spread(lp, witness.W if proof.lower_bound else None, 0.0, 0.0, np.inf),
+            measure=_spread(lp, witness.mu, 0.0, 0.0, 0.0),
             cell_status=lp.cell_status,
-            witness=spread(w, 0.0, 0.0, 0.0),
+            witness=_spread(lp, w, 0.0, 0.0, 0.0),
             control_vectors=lp.controls,
             lp=lp,
             **more,
         )
+
+
+def _spread(
+    lp: StabilizationLP, values: Floats | None, missing: float, attractor: float, outside: float
+) -> Floats:
+    """Return values on C over all cells; ``missing`` on C where there are none."""
+    known = np.full(lp.n, missing) if values is None else values
+    return lp.expand(np.asarray(known, dtype=np.float64), attractor, outside)

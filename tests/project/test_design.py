@@ -199,6 +199,18 @@ def test_no_file_is_too_long():
     assert not long
 
 
+def test_no_function_is_too_long():
+    """Its docstring does not count."""
+    long = {}
+    for name, path in house.modules(PACKAGE).items():
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                first = node.body[ast.get_docstring(node) is not None :]
+                if first and (n := node.end_lineno - first[0].lineno + 1) > 44:
+                    long[f"{name}.{node.name}"] = n
+    assert not long
+
+
 def test_no_kernel_takes_too_many_arguments():
     """Arrays that belong together come as a named tuple."""
     for name, path in house.modules(PACKAGE).items():

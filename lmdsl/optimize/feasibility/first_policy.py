@@ -112,17 +112,12 @@ def stabilizing(lp: StabilizationLP, time_up: TimeUp = never) -> Feasible | Refu
 
 def _raising(lp: StabilizationLP, time_up: TimeUp) -> Iterator[Feasible | Refused | Undecided]:
     """Raise gamma step by step; yield what is known after each, the decision last."""
-    g = lp.growth
+    swept = _swept(lp, time_up)
+    if swept is not None:
+        yield swept
+        return
     level, policy = lp._algorithm_1
-    V = level.astype(np.float64)
-    for k in range(4 if level.max() <= NEAR else 0):
-        better = bellman.rise(lp, V, g, k % 2 == 1)
-        V = better.value
-        w = _proved(lp, better.policy, V, time_up) if k in (0, 3) else None
-        if w is not None:
-            yield Feasible(better.policy, w)
-            return
-    unit, asked = np.ones(lp.K), g == 1
+    unit, asked = np.ones(lp.K), lp.growth == 1
     for horizon in (4.0 * level.max(), 64.0 * level.max()):
         at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
         for _ in range(4):
@@ -149,17 +144,39 @@ def _raising(lp: StabilizationLP, time_up: TimeUp) -> Iterator[Feasible | Refuse
             return
         if time_up():
             return
-        # Raise gamma as far towards g as this policy allows, by bisection from above (of exponents,
-        # as long as g is out of sight).
-        reach, raised = g, None
-        while raised is None and reach > at * (1 + 1e-13):
-            far = reach > 4 * at
-            reach = math.sqrt(at) * math.sqrt(reach) if far else at + (reach - at) / 2
-            raised, _ = stability_vector(lp, policy, g=reach, time_up=time_up)
+        at, raised = _raised(lp, policy, at, time_up)
         if raised is None:
             return
-        at, value = reach, raised
+        value = raised
         yield Undecided(policy, at)
+
+
+def _swept(lp: StabilizationLP, time_up: TimeUp) -> Feasible | None:
+    """Return a greedy policy of a few passes of value iteration, None where none is proved."""
+    level, _ = lp._algorithm_1
+    V = level.astype(np.float64)
+    for k in range(4 if level.max() <= NEAR else 0):
+        better = bellman.rise(lp, V, lp.growth, k % 2 == 1)
+        V = better.value
+        w = _proved(lp, better.policy, V, time_up) if k in (0, 3) else None
+        if w is not None:
+            return Feasible(better.policy, w)
+    return None
+
+
+def _raised(
+    lp: StabilizationLP, policy: Pairs, at: float, time_up: TimeUp
+) -> tuple[float, Floats | None]:
+    """Raise gamma as far towards g as a policy allows; return it, and a proof if it was raised.
+
+    By bisection from above: of exponents, as long as g is out of sight.
+    """
+    reach, raised = lp.growth, None
+    while raised is None and reach > at * (1 + 1e-13):
+        far = reach > 4 * at
+        reach = math.sqrt(at) * math.sqrt(reach) if far else at + (reach - at) / 2
+        raised, _ = stability_vector(lp, policy, g=reach, time_up=time_up)
+    return reach, raised
 
 
 def _decided(lp: StabilizationLP, time_up: TimeUp) -> Feasible | Refused | Undecided:

@@ -84,12 +84,14 @@ def iterate(
     iteration); only a policy evaluated to the end is returned as the last.
     """
     screen = Screen(lp, gamma, cost)
-    gamma, cost = screen.gamma, screen.cost
+    sweeps = _Sweeps(screen, time_up)
     rows: Peeled | None = None  # those of the policy at hand
     V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
     hasty = False  # the policy at hand was not evaluated at all
-    swept = 0  # sweeps that did not reach the end
-    stalls = True  # sweeps do, in a single mode, as far as was seen
+
+    def ended(converged: bool) -> Iteration:
+        return Iteration(*(last or (policy, V)), step, converged, screen)
+
     while True:
         out = time_up() or step == limit
         done = screen.improve(V, policy, TIE) if not out else Pass(V, policy, 0, 0)
@@ -98,52 +100,67 @@ def iterate(
             step += 1
             x = done.value
             hasty = not hasty and (step == 1 or done.changed * FEW < lp.n)
-            if hasty:
-                rows = None
-            else:
-                x = x.copy()
-                sweeps = min(max(done.looked // lp.n, LEAST_SWEEPS), MOST_SWEEPS)
-                rows = Peeled.of(screen.slots.current)  # the pass copied them
-                fall = 0.0 if rows.small else _fall(V, x)
-                far, left = 0.0, np.inf
-                if stalls and not rows.small:
-                    far = extrapolation.extrapolate(rows.system, screen.policy_cost, x)
-                    stalls = 2 * far > sweeps
-                positive = bool((screen.policy_cost > 0).all())  # else what is free has to become 0
-                slow = swept > PATIENCE and positive
-                if slow:
-                    enough = 0.1 * (fall or _fall(V, x))
-                    slow = equations.descend(rows, screen.policy_cost, x, enough, time_up)
-                    swept = swept if slow else 0
-                if far < sweeps and not slow:
-                    left = equations.advance(rows, screen.policy_cost, x, sweeps, 0.1 * fall, 0.0)
-                    if left > TOLERANCE and left > 0.1 * (fall or _fall(V, x)):
-                        swept += sweeps
-                exact = x if left <= TOLERANCE and positive else None
-                x = np.minimum(x, done.value)
+            rows = None if hasty else Peeled.of(screen.slots.current)  # the pass copied them
+            if rows:
+                x, exact = sweeps.lower(rows, V, done)
             screen.follow(V, x)
             policy, V = done.policy, x
         elif last is not None and last[0] is policy:
-            return Iteration(*last, step, not out, screen)
+            return ended(not out)
         else:
             try:
-                rows = rows or Peeled.of(screen.slots.system(policy))
-                exact = evaluate(lp, policy, gamma, cost, done.value, True, time_up, rows)
-                if exact is None:
-                    exact = evaluate(lp, policy, gamma, cost, time_up=time_up)
+                exact = _to_the_end(screen, policy, V, rows, time_up)
             except Stopped:
-                return Iteration(*(last or (policy, V)), step, False, screen)
+                return ended(False)
             if exact is None:
-                return Iteration(*(last or (policy, V)), step, last is not None and not out, screen)
+                return ended(last is not None and not out)
             screen.follow(V, np.minimum(exact, V))
             V = exact
         if exact is not None:
             if last is not None and not (exact < last[1]).any():
-                # Rounding made a change look better than it is.
-                return Iteration(*last, step, not out, screen)
+                return ended(not out)  # rounding made a change look better than it is
             last = policy, exact
         if out:
-            return Iteration(*(last or (policy, V)), step, False, screen)
+            return ended(False)
+
+
+class _Sweeps:
+    """Evaluations that are cut short: sweeps, about as long as the improvement took."""
+
+    def __init__(self, screen: Screen, time_up: TimeUp) -> None:
+        self.screen, self.time_up = screen, time_up
+        self.swept = 0  # sweeps that did not reach the end
+        self.stalls = True  # sweeps do, in a single mode, as far as was seen
+
+    def lower(self, rows: Peeled, V: Floats, done: Pass) -> tuple[Floats, Floats | None]:
+        """Return a value between those before and after, and the exact one where that is it."""
+        x, cost = done.value.copy(), self.screen.policy_cost
+        count = min(max(done.looked // len(x), LEAST_SWEEPS), MOST_SWEEPS)
+        fall = 0.0 if rows.small else _fall(V, x)
+        far, left = 0.0, np.inf
+        if self.stalls and not rows.small:
+            far = extrapolation.extrapolate(rows.system, cost, x)
+            self.stalls = 2 * far > count
+        positive = bool((cost > 0).all())  # else what is free has to become 0
+        slow = self.swept > PATIENCE and positive
+        if slow:
+            slow = equations.descend(rows, cost, x, 0.1 * (fall or _fall(V, x)), self.time_up)
+            self.swept = self.swept if slow else 0
+        if far < count and not slow:
+            left = equations.advance(rows, cost, x, count, 0.1 * fall, 0.0)
+            if left > TOLERANCE and left > 0.1 * (fall or _fall(V, x)):
+                self.swept += count
+        return np.minimum(x, done.value), x if left <= TOLERANCE and positive else None
+
+
+def _to_the_end(
+    screen: Screen, policy: Pairs, V: Floats, rows: Peeled | None, time_up: TimeUp
+) -> Floats | None:
+    """Return the value of a policy with V >= T_u V, None where none is found."""
+    lp, gamma, cost = screen.lp, screen.gamma, screen.cost
+    rows = rows or Peeled.of(screen.slots.system(policy))
+    exact = evaluate(lp, policy, gamma, cost, V, True, time_up, rows)
+    return evaluate(lp, policy, gamma, cost, time_up=time_up) if exact is None else exact
 
 
 def _fall(before: Floats, after: Floats) -> float:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lmdsl.common.types import Bools, Floats, Pairs, never
+from lmdsl.common.types import Bools, Floats, Indices, Pairs, never
 from lmdsl.common.types import TimeUp as TimeUp
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Stopped
@@ -54,11 +54,7 @@ def canonical(
         columns = np.flatnonzero(ties)[found.surviving]
         inside = np.flatnonzero(found.inside)
         sub = lp.part(columns, inside)
-        start = np.searchsorted(columns, policy[inside])
-        start = np.minimum(start, len(columns) - 1)
-        owned = columns[start] == policy[inside]
-        if not owned.all():
-            start = np.where(owned, start, sub._algorithm_1[1])
+        start = _renumbered(columns, policy[inside], sub)
     del ties
     unit = np.ones(sub.K)
     w = _even(sub, start, lp.growth, np.ones(sub.n))
@@ -78,6 +74,13 @@ def canonical(
     column = first_column(sub, equal)
     chosen[inside] = column if columns is None else columns[column]
     return chosen
+
+
+def _renumbered(columns: Indices, policy: Pairs, sub: StabilizationLP) -> Pairs:
+    """Return a policy in the columns of a part; where it has none, that of Algorithm 1."""
+    place = np.minimum(np.searchsorted(columns, policy), len(columns) - 1)
+    owned = columns[place] == policy
+    return place if owned.all() else np.where(owned, place, sub._algorithm_1[1])
 
 
 def _taken_by_ties(lp: StabilizationLP, count: int) -> int:
