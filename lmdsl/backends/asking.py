@@ -36,20 +36,10 @@ def ask(
 ) -> tuple[Solution, Iteration | None, str]:
     """Ask a backend; whatever it raises, returns or prints, a well-formed solution comes out.
 
-    Returns
-    -------
-    solution
-        Its arrays are new, of class ndarray, in C order, finite and of the right length; ``policy``
-        names a column of each cell's own; parts that are not so are None. ``details`` is empty.
-    iteration
-        The last step of policy iteration, where it is our own that was asked.
-    log
-        What it printed.
-
-    Raises
-    ------
-    BadInput
-        The backend refuses the options, or a package is missing.
+    Returns it, the last step of policy iteration where that was asked, and what was printed. The
+    arrays are new, of class ndarray, in C order, finite and of the right length; ``policy`` names a
+    column of each cell's own; parts that are not so are None. BadInput: the backend refuses the
+    options, or a package is missing.
     """
     if options.max_iterations is not None:  # solvers take 32-bit integers
         options = replace(options, max_iterations=min(int(options.max_iterations), 2**31 - 1))

@@ -77,13 +77,7 @@ LEAST_TOLERANCE = 1e-12
 
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:
-    """Solve with a solver of CVXPY.
-
-    Raises
-    ------
-    BadInput
-        CVXPY does not find the solver.
-    """
+    """Solve with a solver of CVXPY; BadInput where CVXPY does not find it."""
     return ScaledLP.of(lp).solved(_solved, options)
 
 

@@ -73,13 +73,7 @@ STOPS = {
 
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:
-    """Solve with HiGHS.
-
-    Raises
-    ------
-    MissingDependency
-        This installation of highspy lacks the algorithm.
-    """
+    """Solve with HiGHS; MissingDependency where this highspy lacks the algorithm."""
     return ScaledLP.of(lp).solved(_solved, options)
 
 

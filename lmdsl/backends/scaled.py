@@ -47,10 +47,7 @@ class ScaledLP:
     def of(cls, lp: StabilizationLP) -> ScaledLP:
         """Scale the LP with weight ``lp.solve_weight``.
 
-        Raises
-        ------
-        MemoryError
-            It does not fit; how much a solver takes beside it is not known.
+        MemoryError where it does not fit; how much a solver takes beside it is not known.
         """
         needed = ENTRY * (len(lp.rows.target) + 2 * lp.K)
         if not memory.fits(needed):
@@ -75,12 +72,7 @@ class ScaledLP:
     def solved(self, native: Callable[[ScaledLP, Options], Solution], options: Options) -> Solution:
         """Ask a solver, in a process of its own where it might not end in time (apart.py).
 
-        Parameters
-        ----------
-        native
-            A function of a module that imports no more than the solver.
-        options
-            As the backend got them.
+        ``native`` is a function of a module that imports no more than the solver.
         """
         limit = options.time_limit
         if self.time_up(limit):
@@ -105,15 +97,10 @@ class ScaledLP:
         iterations: int | None,
         details: Mapping[str, Any] | None = None,
     ) -> Solution:
-        """Return what a solver found, in the units of the model.
+        """Return what a solver found, in the units of the model; other parameters as in Solution.
 
-        Parameters
-        ----------
-        stop, word, iterations, details
-            As in :class:`Solution`.
-        y, x
-            Multipliers of A x = b with the sign of V, and x; None where there are none. Dropped
-            where not finite, where they are a ray, and where no iteration made them.
+        y are the multipliers of A x = b with the sign of V; y and x are None where there are none,
+        and dropped where not finite, where they are a ray, and where no iteration made them.
         """
         ray = stop in (Stop.INFEASIBLE, Stop.UNBOUNDED)
         if ray or not (stop.success or iterations):

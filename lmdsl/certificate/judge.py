@@ -117,16 +117,9 @@ CLAIMS = (STABILIZING, UPPER_BOUND, LOWER_BOUND, MEASURE, REFUSAL)
 
 
 def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
-    """Check every claim of a witness against the finite model.
+    """Check every claim of a witness, nothing of which is trusted, against the finite model.
 
-    Parameters
-    ----------
-    lp
-        The finite model.
-    witness
-        Policy and vectors; nothing in it is trusted.
-    tolerance
-        Largest gap that counts as verified.
+    ``tolerance`` is the largest gap that counts as verified.
     """
     policy, own = _policy(lp, witness), np.arange(lp.n)
     under = lp if policy is None else lp.under(policy)
@@ -155,14 +148,9 @@ def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certific
 def exact_verdict(
     lp: StabilizationLP, witness: Witness, tolerance: float, guard: Guard | None = None
 ) -> Certificate:
-    """Check every claim of a witness in rational arithmetic.
+    """Check every claim of a witness in rational arithmetic; ``guard`` may raise now and then.
 
-    Parameters
-    ----------
-    lp, witness, tolerance
-        As for :func:`verdict`; a claim that holds only with equality holds.
-    guard
-        Called now and then; it may raise.
+    A claim that holds only with equality holds.
     """
     policy = _policy(lp, witness)
     columns = np.empty(0, dtype=np.int64) if policy is None else policy

@@ -43,19 +43,9 @@ def largest(expected: Expected) -> int:
 def unpacked(file: BinaryIO, name: str, expected: Expected) -> dict[str, NDArray[Any]]:
     """Read arrays of known shape and type from an .npz file, whatever it claims to hold.
 
-    Parameters
-    ----------
-    file
-        The open file, at its start, no larger than :func:`largest` says.
-    name
-        Its name, for messages.
-    expected
-        Shape and type of each array; others in the file are not looked at.
-
-    Raises
-    ------
-    BadInput
-        A member is missing, compressed beyond its size, or not exactly of the expected kind.
+    The file is open, at its start, and no larger than :func:`largest` says; ``name`` is for
+    messages; others than the expected arrays are not looked at. BadInput: one is missing,
+    compressed beyond its size, or not exactly of the expected kind.
     """
     arrays: dict[str, NDArray[Any]] = {}
     bounded = _Bounded(file)

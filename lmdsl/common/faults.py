@@ -49,15 +49,7 @@ class _Fault(NamedTuple):
 
 
 def condensed(error: ValidationError, model: Any) -> BadInput:
-    """Return all faults of a report as one error; misspelt keys come first.
-
-    Parameters
-    ----------
-    error
-        The report of pydantic.
-    model
-        The model that was validated.
-    """
+    """Return all faults of pydantic's report on a model as one error; misspelt keys come first."""
     faults = [_fault(item, model) for item in error.errors(include_url=False)]
     meant = {fault.meant for fault in faults if fault.meant}
     faults = [fault for fault in faults if fault.where not in meant or not _missing(fault)]

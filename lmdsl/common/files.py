@@ -20,12 +20,8 @@ MAX_ITEMS = 1_000_000
 def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
     """Write a file so that it appears whole or not at all; a long one piece by piece.
 
-    Where a link stands, what it points to is written; a pipe or a device gets the bytes.
-
-    Raises
-    ------
-    BadInput
-        The path cannot be written.
+    Where a link stands, what it points to is written; a pipe or a device gets the bytes. BadInput
+    where the path cannot be written.
     """
     pieces = [content] if isinstance(content, bytes) else content
     try:

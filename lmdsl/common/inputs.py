@@ -15,13 +15,7 @@ MOST = 10**15
 
 
 def whole(value: Any, where: str, least: int = 1, most: float = MOST) -> int:
-    """Return a whole number in a range.
-
-    Raises
-    ------
-    BadInput
-        It is none; booleans are no numbers.
-    """
+    """Return a whole number in a range; else BadInput. Booleans are no numbers."""
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise BadInput(f"{shown(value)} is not a whole number >= {least}", where)
     number = int(value)
@@ -88,20 +82,9 @@ def interval(value: Any, where: str) -> tuple[float, float]:
 def states(x: Any, names: Sequence[str], where: str = "") -> Floats:
     """Return states, shape (..., d), in the order of the axes.
 
-    Parameters
-    ----------
-    x
-        An array or nested sequence, shape (..., d); or what carries names: a mapping from axes to
-        arrays, a table with these columns, a labelled row or a structured array, in any order.
-    names
-        Names of the axes.
-    where
-        The argument at fault.
-
-    Raises
-    ------
-    BadInput
-        The names are others, the shape is wrong, or something is no real number.
+    x is an array or nested sequence, shape (..., d); or what carries names: a mapping from axes to
+    arrays, a table with these columns, a labelled row or a structured array, in any order.
+    BadInput: the names are others, the shape is wrong, or something is no real number.
     """
     d = len(names)
     columns = _columns(x, names, where)

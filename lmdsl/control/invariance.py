@@ -83,14 +83,8 @@ def examine(
 ) -> LocalCheck:
     """Check whether the local controller of a problem keeps the attractor cells.
 
-    Parameters
-    ----------
-    problem, local
-        The problem and its local controller.
-    deadline
-        Ends the work with what is known.
-    samples
-        How many random states to try; by default as many as take some seconds.
+    The deadline ends the work with what is known; ``samples`` are as many random states as take
+    some seconds where their number is not given.
     """
     cells = np.flatnonzero(local.attractor)
     asked, nodes = Deadline.of(deadline), noise_nodes(problem).values

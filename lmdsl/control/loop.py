@@ -62,13 +62,7 @@ class ClosedLoop:
     def step(
         self, x: Floats, cell: Indices, rng: np.random.Generator, deadline: Deadline = FOREVER
     ) -> tuple[Floats, Indices]:
-        """Return the next states, shape (r, d), and their cells, -1 outside the box.
-
-        Raises
-        ------
-        TimeLimitReached
-            The deadline has passed.
-        """
+        """Return the next states, shape (r, d), and their cells, -1 outside the box."""
         u = self.controller.at(cell, x)
         noise: list[Floats] = []
         if self.problem.noises:
@@ -81,12 +75,8 @@ class ClosedLoop:
     ) -> tuple[Indices, Indices, Floats]:
         """Run from states until A, loss, the step limit, or the deadline.
 
-        Returns
-        -------
-        outcome, taken
-            Per run.
-        arrived
-            The states in which the runs that reached A entered it, in no particular order.
+        Returns outcome and number of steps of each run, and the states, in no particular order, in
+        which the runs that reached A entered it.
         """
         x, cell = self.partition.enter(x)
         arrived = [x[:0]]

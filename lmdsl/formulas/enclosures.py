@@ -98,12 +98,7 @@ class Jet:
 def enclosure(box: Jet, centre: Jet, away: Sequence[Interval]) -> Interval:
     """Return what contains all values computed on a box: N and the mean value form, intersected.
 
-    Parameters
-    ----------
-    box, centre
-        The jets of a formula on the box and at a point of it.
-    away
-        The box minus that point, in every direction.
+    ``centre`` is the jet at a point of the box, ``away`` the box minus that point by direction.
     """
     mean = centre.value
     for k, by in enumerate(away):

@@ -125,20 +125,11 @@ class Program:
     def __call__(
         self, values: Mapping[str, NDArray[Any] | float], guard: Guard | None = None
     ) -> tuple[Floats, ...]:
-        """Evaluate all formulas.
+        """Return a new array for each formula, in the broadcast shape of the names it uses.
 
-        Parameters
-        ----------
-        values
-            An array or number for each of `names`, in shapes that broadcast together.
-            They are read as float64 and never changed; other keys are ignored.
-        guard
-            Called before every operation; it may raise.
-
-        Returns
-        -------
-        tuple of ndarray
-            One new array per formula, in the broadcast shape of the names it uses.
+        ``values`` has an array or number for each of `names`, in shapes that broadcast together;
+        they are read as float64 and never changed, other keys ignored. ``guard`` is called before
+        every operation.
         """
         if not self.names <= values.keys():
             missing = ", ".join(sorted(self.names.difference(values)))
@@ -166,12 +157,7 @@ class Program:
     def enclose(self, values: Mapping[str, Jet], guard: Guard | None = None) -> tuple[Jet, ...]:
         """Enclose all formulas and their derivatives on boxes (see enclosures.py).
 
-        Parameters
-        ----------
-        values
-            A jet for each of `names`, all with the same number of directions.
-        guard
-            Called before every operation; it may raise.
+        ``values`` has a jet for each of `names`, all with the same number of directions.
         """
         directions = max((len(jet.slope.low) for jet in values.values()), default=0)
         slots: list[Any] = [

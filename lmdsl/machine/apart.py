@@ -41,23 +41,10 @@ def call(
 ) -> T:
     """Return ``function(*arguments)``, made by a child where that is worth it.
 
-    Parameters
-    ----------
-    function
-        A function of a module, by name; what it writes to standard output goes to standard error.
-    arguments
-        What can be pickled.
-    deadline, doing
-        When it ends, and what the error then says.
-    entries
-        Size of the matrix; few are not worth a child as long as there is no deadline.
-
-    Raises
-    ------
-    TimeLimitReached
-        The child was ended at the deadline.
-    Ended
-        The child ended otherwise.
+    The function is one of a module, the arguments can be pickled; what it prints goes to standard
+    error. Few ``entries`` of a matrix are not worth a child unless there is a deadline.
+    TimeLimitReached, with ``doing``: the child was ended at the deadline; Ended: it ended
+    otherwise.
     """
     small = deadline.left is None and entries < LARGE
     if small or not sys.executable:  # embedded in another program there is no Python to start

@@ -82,10 +82,7 @@ threads = numba.config.NUMBA_NUM_THREADS if numba else 1
 def kernel(function: Any = None, allocates: bool = False) -> Any:
     """Compile a function when it is called, as ``njit`` does, but no more than is needed.
 
-    Parameters
-    ----------
-    allocates
-        It makes arrays of its own.
+    It makes arrays of its own only where it ``allocates``.
     """
     if function is None:
         return lambda function: kernel(function, allocates)

@@ -27,15 +27,7 @@ class Room(NamedTuple):
 
 
 def available(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> Room:
-    """Return the tightest limit.
-
-    Parameters
-    ----------
-    root
-        The folder that holds ``proc`` and ``sys``.
-    environ
-        The environment, with what Slurm says.
-    """
+    """Return the tightest limit; ``root`` holds ``proc`` and ``sys``, ``environ`` names Slurm."""
     rooms = [_free(root), *_groups(root), *_ulimits(root), *_slurm(root, environ)]
     least = min(rooms)
     return Room(max(least.bytes, 0), least.limit)
@@ -47,13 +39,7 @@ def fits(estimate: float) -> bool:
 
 
 def require(estimate: float, what: str) -> None:
-    """Refuse work whose estimate exceeds the available memory, before any of it is taken.
-
-    Raises
-    ------
-    BadInput
-        With the estimate, the limit and the fix.
-    """
+    """Refuse work whose estimate exceeds the available memory, before any of it is taken."""
     if estimate <= TRIFLE:
         return
     room = available()

@@ -35,10 +35,7 @@ _users = 0
 def foreign() -> Iterator[Callable[[], str]]:
     """Run foreign code: nothing that it prints reaches standard output.
 
-    Yields
-    ------
-    callable
-        Returns what was printed, its last 64 KiB, also after the end.
+    Yields what returns the last 64 KiB of what was printed, also after the end.
     """
     diverted = _enter()
     printed: list[str] = []

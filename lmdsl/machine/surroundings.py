@@ -32,15 +32,10 @@ def own_arithmetic(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def restore_rounding(who: str) -> None:
-    """Let the processor round to nearest, and keep tiny numbers, again.
+    """Let the processor round to nearest, and keep tiny numbers, again; LmdslError if it does not.
 
     Libraries built for speed set it to lose denormal numbers when they are loaded, others to round
     in one direction; no bound would hold then.
-
-    Raises
-    ------
-    LmdslError
-        It cannot be restored.
     """
     if _rounds_to_nearest():
         return

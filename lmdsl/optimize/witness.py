@@ -47,16 +47,8 @@ def certify(
 ) -> Verified:
     """Make the vectors of claims 1 to 4 for a policy and check them.
 
-    Parameters
-    ----------
-    lp, policy
-        The finite model and one column per cell.
-    tolerance
-        Largest gap that counts as verified.
-    value
-        The policy's value as :func:`~evaluation.evaluate` gives it; made where missing.
-    time_up
-        Ends the work; what is not established by then is not claimed.
+    ``value`` is the policy's as :func:`~evaluation.evaluate` gives it, made where missing; what is
+    not established when ``time_up`` ends the work is not claimed.
     """
     try:
         witness, V = _first_try(lp, policy, tolerance, value, time_up)

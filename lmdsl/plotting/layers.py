@@ -42,12 +42,8 @@ MOST_RUNS = 5_000
 def blank(columns: float = 1, rows: float = 1) -> Any:
     """Return an empty figure on an Agg canvas.
 
-    Raises
-    ------
-    MissingDependency
-        matplotlib is not installed.
-    BadInput
-        The environment names a backend that this matplotlib does not know.
+    MissingDependency without matplotlib; BadInput where the environment names a backend it does not
+    know.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -125,11 +125,8 @@ def starts_of(result: Result, starts: int | ArrayLike, seed: int) -> Floats:
 def closed_loop(result: Result, x: Floats, steps: int, seed: int) -> tuple[Floats, Indices, int]:
     """Run the true map under the controller until A, loss, or the step limit.
 
-    Returns
-    -------
-    points, cell, pieces
-        States, shape (T, r, d), NaN after the end of a run; the last cell of each run, -1
-        outside the box; and the number of states a step.
+    Returns the states, shape (T, r, d), NaN after the end of a run; the last cell of each run, -1
+    outside the box; and the number of states a step.
     """
     loop, problem, p = result.closed_loop, result.problem, result.partition
     rng = np.random.default_rng(seed)

@@ -125,20 +125,11 @@ def rectangles(mask: Bools, x: Floats, y: Floats) -> Floats:
 
 
 def segments(points: Floats, view: View) -> tuple[Floats, Indices]:
-    """Join successive states of runs by lines that break where a periodic axis wraps.
+    """Join successive states of runs, (T, r, d), NaN from where a run has ended, by lines.
 
-    Parameters
-    ----------
-    points
-        Shape (T, r, d): r runs, NaN from where a run has ended.
-    view
-        The axes to draw.
-
-    Returns
-    -------
-    segments, run
-        Shape (S, 2, 2) and (S,). A line takes the shorter way round; across a seam it leaves on
-        one side and, as a second segment, enters on the other.
+    Returns them, shape (S, 2, 2), and their runs, (S,). A line takes the shorter way round a
+    periodic axis; across the seam it leaves on one side and, as a second segment, enters on the
+    other.
     """
     p, axes = view.partition, list(view.axes)
     span = (p.high - p.low)[axes]

@@ -35,10 +35,7 @@ def program(
 ) -> Program:
     """Compile the formulas of the states, in the given order, into one program.
 
-    Raises
-    ------
-    BadInput
-        A formula is missing, belongs to no state, or cannot be parsed.
+    BadInput: a formula is missing, belongs to no state, or cannot be parsed.
     """
     for state in order:
         if state not in formulas:

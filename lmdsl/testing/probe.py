@@ -50,12 +50,8 @@ class Probe:
     def ask(self, lp: StabilizationLP, **options: Any) -> Solution:
         """Return a well-formed solution.
 
-        Raises
-        ------
-        Unjudged
-            There is none; the check ``solution`` will say so.
-        MissingDependency
-            The algorithm is not installed.
+        Unjudged: there is none; the check ``solution`` will say so. MissingDependency: the
+        algorithm is not installed.
         """
         try:
             found: Solution = self.raw(lp, **options)

@@ -39,12 +39,8 @@ class Lines:
     def of(cls, program: Program, controls: Collection[str]) -> Self | None:
         """Split a program; None where that does not pay, or large arrays need more than arithmetic.
 
-        Parameters
-        ----------
-        program
-            The formulas.
-        controls
-            Names of the values that vary along one axis, all others varying along the rest.
+        ``controls`` are the names of the values that vary along one axis, all others along the
+        rest.
         """
         varying = _varying(program, controls)
         if varying is None or not LEAST <= len(varying) <= MOST:

@@ -52,13 +52,9 @@ def assemble(
 ) -> Transitions:
     """Build the rows of every admissible pair.
 
-    Raises
-    ------
-    TimeLimitReached
-        The deadline has passed, and it was more than a moment's work.
-    BadInput
-        The problem does not fit in memory, or the stage cost of an admissible pair is negative
-        or not finite at a sample.
+    TimeLimitReached: the deadline has passed, and it was more than a moment's work. BadInput: the
+    problem does not fit in memory, or the stage cost of an admissible pair is negative or not
+    finite at a sample.
     """
     require_least(problem)
     deadline = unless_short(problem, Deadline.of(deadline))

@@ -53,13 +53,7 @@ class Partition(Frozen):
 
     @classmethod
     def of(cls, problem: Problem) -> Self:
-        """Return the partition that a problem declares.
-
-        Raises
-        ------
-        BadInput
-            There are more cells than 32-bit indices.
-        """
+        """Return the partition that a problem declares; BadInput beyond 32-bit indices."""
         axes = problem.state_box.values()
         size = math.prod(axis.cells for axis in axes)
         if size > MAX_CELLS:

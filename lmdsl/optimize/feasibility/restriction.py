@@ -15,15 +15,7 @@ from lmdsl.optimize.feasibility.gamma_bar import GammaBar
 def refusal_message(
     lp: StabilizationLP, w: Floats, limits: GammaBar, bracket: tuple[float, float]
 ) -> str:
-    """Return the sentence that refuses a gamma: the bracket, the cells, and what can be done.
-
-    Parameters
-    ----------
-    lp, w
-        The model, and the vector that proves its gamma infeasible, shape (n,).
-    limits, bracket
-        What is known of gamma_bar.
-    """
+    """Return the sentence that refuses a gamma: the bracket, the cells, and what can be done."""
     cells = Area.of(lp.partition, lp.cells[w > 0])
     left = lp.n - len(cells)
     parts = [
@@ -52,19 +44,10 @@ def _counted(area: Area) -> str:
 def restricted(lp: StabilizationLP, w: Floats) -> StabilizationLP | None:
     """Leave out the cells a refusal proves infeasible, and the pairs that can lead to them.
 
-    With w the greatest solution of w = min(1, gamma min_a P_a w), every cell with w = 0 keeps a
-    pair whose successors all have w = 0: the smaller model is the part on which gamma is feasible.
-
-    Parameters
-    ----------
-    lp, w
-        The model and the vector of its refusal (claim 6), shape (n,).
-
-    Returns
-    -------
-    StabilizationLP or None
-        The model on the cells with w = 0; the others get the status BEYOND_GAMMA. None where no
-        cell is left, or one is left without a pair.
+    With w, the vector of claim 6, the greatest solution of w = min(1, gamma min_a P_a w), every
+    cell with w = 0 keeps a pair whose successors all have w = 0: the smaller model is the part on
+    which gamma is feasible. The other cells get the status BEYOND_GAMMA. None where no cell is
+    left, or one is left without a pair.
     """
     inside, out = np.flatnonzero(w == 0), ~(w == 0)  # also where a file says -1 or NaN
     beyond = np.append(out, False)

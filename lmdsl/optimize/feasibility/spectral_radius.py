@@ -82,14 +82,8 @@ def of_policy(
 ) -> PolicyClasses:
     """Take a policy apart into classes and estimate the spectral radius of each.
 
-    Parameters
-    ----------
-    lp, policy, time_up
-        The model, a column per cell, and what ends the work.
-    start, enough
-        A guess of x, and how well the rates have to be known, relative.
-    inside
-        Cells that alone count: runs that leave them end.
+    ``start`` is a guess of x, ``enough`` how well the rates have to be known, relative; where only
+    the cells ``inside`` count, runs that leave them end.
     """
     P = lp.rows.matrix(policy)
     if inside is not None:
@@ -192,16 +186,8 @@ def improved(
 
     A control a with (P_a w)_i < (P_u w)_i keeps P_u w <= lam w, w > 0 being the vector that proves
     the limit 1/lam: no step lowers it. While the limit still rises fast, the rates need not be
-    known well.
-
-    Parameters
-    ----------
-    lp, found, time_up
-        The model, a policy, and what ends the work.
-    until, least
-        A limit that is enough, and the relative gain of a step below which it is the last.
-    inside
-        As in :func:`of_policy`, of which ``found`` then comes.
+    known well. ``until`` is a limit that is enough; a step of a relative gain below ``least`` is
+    the last. ``inside`` as in :func:`of_policy`, of which ``found`` then comes.
     """
     enough = COARSE
     with suppress(Stopped):

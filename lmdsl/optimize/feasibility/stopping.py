@@ -43,22 +43,12 @@ def optimal_stopping(
     time_up: TimeUp = never,
     limit: int = 1000,
 ) -> Stopping | None:
-    """Stop in a cell for ``reward``, or go on under the least favourable control, for ever.
+    """Stop in a cell for ``reward`` >= 0, or go on under the least favourable control, for ever.
 
     Howard's policy iteration with "stop" as one more control, as :func:`iterate` makes it. Every
-    policy stays transient under gamma P, so a policy that ends with every cell going and w = 0
-    is gamma-stabilizing.
-
-    Parameters
-    ----------
-    lp, gamma
-        The model and the weight.
-    reward
-        Shape (n,), >= 0.
-    policy, going
-        A first policy, transient under gamma P on the cells that go; default: stop everywhere.
-    time_up, limit
-        End the work, with None; largest number of steps.
+    policy stays transient under gamma P, so a policy that ends with every cell going and w = 0 is
+    gamma-stabilizing. The first policy is to be so on the cells that go; by default all stop. None
+    where ``time_up`` ended the work.
     """
     policy = lp.pair_pointer[:-1].copy() if policy is None else policy
     going = np.zeros(lp.n, dtype=np.bool_) if going is None else going

@@ -44,23 +44,9 @@ def solve(
 ) -> Floats | None:
     """Return x >= 0 with x = b + M x, or None where there is none (as far as rounding can tell).
 
-    Parameters
-    ----------
-    M
-        Sparse CSR array of shape (n, n), entries >= 0.
-    b
-        Shape (n,), entries >= 0.
-    start
-        A guess, shape (n,), >= 0.
-    enough, flat
-        Relative, and absolute, change of a sweep that ends the work.
-    time_up
-        Asked after the first few sweeps, then again and again between sweeps and classes.
-
-    Raises
-    ------
-    Stopped
-        ``time_up`` said so.
+    M is a CSR array (n, n), b and the guess ``start`` have shape (n,), all entries >= 0. A sweep of
+    relative change ``enough``, or absolute change ``flat``, ends the work; so does ``time_up``,
+    asked after the first few sweeps, then between sweeps and classes, with Stopped.
     """
     x = np.array(b if start is None else start, dtype=np.float64)
     peeled = Peeled.of(SplitMatrix.of(M))
@@ -121,15 +107,10 @@ def advance(peeled: Peeled, b: Floats, x: Floats, count: int, enough: float, fla
     """Come closer to x = b + M x in place, by about the work of ``count`` sweeps.
 
     From x >= b + M x it lowers x, from below it raises it, as sweeps do. A small core is swept to
-    the end where that is not too much work, then substituted from; where it is not small, all
-    cells are swept until the largest relative change is ``enough`` or no component moves by more
-    than ``flat``.
-
-    Returns
-    -------
-    float
-        Largest relative change of the last sweep, at most ``TOLERANCE`` where x is the solution;
-        infinite where there is none in sight.
+    the end where that is not too much work, then substituted from; where it is not small, all cells
+    are swept until the largest relative change is ``enough`` or no component moves by more than
+    ``flat``. Returns the largest relative change of the last sweep, at most ``TOLERANCE`` where x
+    is the solution; infinite where there is none in sight.
     """
     if not peeled.small:
         return peeled.system.sweep(b, x, count, enough, flat)[1]

@@ -27,15 +27,7 @@ class Improvement:
 def improve(
     lp: StabilizationLP, V: Floats, gamma: float | None = None, cost: Floats | None = None
 ) -> Improvement:
-    """Apply the Bellman operator to V, shape (n,).
-
-    Parameters
-    ----------
-    lp, V
-        The model and a value vector on C.
-    gamma, cost
-        Other than the LP's own; ``cost`` has shape (K,).
-    """
+    """Apply the Bellman operator to V, shape (n,), with its gamma and cost, (K,), or others."""
     value, policy = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
     gamma = lp.gamma if gamma is None else gamma
     cost = lp.cost if cost is None else cost
@@ -46,14 +38,8 @@ def improve(
 def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Improvement:
     """Make a pass of value iteration under unit cost, cell by cell, staying put summed up at once.
 
-    From V <= T V the pass raises V, and it stays below the least unit cost.
-
-    Parameters
-    ----------
-    lp, V, gamma
-        The model, a value vector on C, and the weight.
-    backwards
-        The order in which the cells of a range are visited.
+    From V <= T V the pass raises V, and it stays below the least unit cost. The cells of a range
+    are visited ``backwards`` or forwards.
     """
     value, policy = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
     x = padded(V)

@@ -24,20 +24,9 @@ def evaluate(
 ) -> Floats | None:
     """Return V = G_u + gamma P_u V, shape (n,); None where the policy has no finite value.
 
-    Parameters
-    ----------
-    lp, policy
-        The model, and one column per cell.
-    gamma, cost
-        Other than the LP's own; ``cost`` has shape (K,).
-    start
-        A guess of V.
-    transient
-        The policy is known to be gamma-stabilizing, which saves looking whether it reaches A.
-    time_up
-        Ends the work, with :class:`lmdsl.machine.deadline.Stopped`.
-    rows
-        gamma P_u, where it is at hand.
+    gamma and cost, shape (K,), are the LP's by default; ``start`` is a guess of V, ``rows`` gamma
+    P_u where it is at hand. Of a policy known to be ``transient`` (gamma-stabilizing) nobody looks
+    whether it reaches A. ``time_up`` ends the work with Stopped.
     """
     gamma = lp.gamma if gamma is None else gamma
     b = (lp.cost if cost is None else cost)[policy]

@@ -22,14 +22,8 @@ def survivors(
 ) -> Pairs:
     """Return the columns that may belong to an optimal policy, and those of a first one, ascending.
 
-    Parameters
-    ----------
-    lp
-        The linear program.
-    policy, w
-        A gamma-stabilizing policy, a column per cell, and a proof of it where known.
-    time_up
-        Asked between passes; ends the work with what is known.
+    ``policy`` is gamma-stabilizing, w a proof of it where known; ``time_up`` ends the work with
+    what is known.
     """
     start = iteration.bound(lp, policy, w)
     if start is None:

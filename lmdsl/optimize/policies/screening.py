@@ -99,18 +99,12 @@ class Screen:
         return Slots.of(lp.rows, lp.pair_pointer, self.gamma, lp._directions)
 
     def improve(self, V: Floats, policy: Pairs, margin: float) -> Pass:
-        """Change a control where another one is better by more than a relative margin.
+        """Change a control where another one is better: Q < Q_u - margin |Q_u|.
 
         Cells are visited forwards and backwards by turns, each with the new values of those before
-        it in the same range of cells, so that news travels far in a pass.
-
-        Parameters
-        ----------
-        V, policy
-            Values, shape (n,), and the policy, a column per cell: V >= T_u V. So a policy other
-            than that of the last pass is looked at wherever it differs, as one of its rivals.
-        margin
-            Q < Q_u - margin |Q_u| counts as better.
+        it in the same range of cells, so that news travels far in a pass. V >= T_u V, shape (n,);
+        so a policy other than that of the last pass is looked at wherever it differs, as one of its
+        rivals.
         """
         lp = self.lp
         value, new = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
@@ -133,18 +127,8 @@ class Screen:
     def tied(self, V: Floats, tolerance: float, policy: Pairs) -> tuple[Bools, Pairs, bool]:
         """Find the columns with Q <= Q_min + tolerance |Q_min| at V, and those of a policy.
 
-        Parameters
-        ----------
-        V, tolerance
-            An optimal value, shape (n,), to a relative 1e-9, and what counts as equal, below 1e-7.
-        policy
-            A policy with this value, a column per cell.
-
-        Returns
-        -------
-        ties : shape (K,)
-        first : shape (n,), the first tied column of every cell
-        several : whether a cell has more than one
+        V is optimal to a relative 1e-9, and of the policy. Returns the ties, shape (K,), the
+        first tied column of every cell, shape (n,), and whether a cell has more than one.
         """
         lp = self.lp
         x, ties = vectors.padded(V), np.empty(lp.K, dtype=np.bool_)

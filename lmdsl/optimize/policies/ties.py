@@ -23,20 +23,13 @@ def canonical(
     screen: Screen | None = None,
     time_up: TimeUp = never,
 ) -> Pairs:
-    """Break ties so that the policy reaches A: the policy that every backend ends with.
+    """Break ties so that an optimal policy reaches A: the policy that every backend ends with.
 
     Tied are the columns with Q <= Q_min + 1e-12 |Q_min|. Among them take those optimal for unit
     cost weighted with g, then the smallest control index; cells from which that cost is infinite
     take the smallest tied index. Where there is no memory for that, the policy at hand stays.
-
-    Parameters
-    ----------
-    lp, policy, value
-        The model, an optimal policy and its value.
-    screen
-        Lower bounds of the rivals of each cell's control at this value, where they are known.
-    time_up
-        Ends the work, with :class:`lmdsl.machine.deadline.Stopped`.
+    ``screen`` knows lower bounds of the rivals at this value; ``time_up`` ends the work with
+    Stopped.
     """
     if screen is None:
         screen = Screen(lp)

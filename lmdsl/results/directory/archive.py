@@ -52,10 +52,7 @@ MODEL = ("pair_pointer", "control", "pointer", "target", "code", "cost")
 def save(result: Result, path: str | os.PathLike[str]) -> None:
     """Write a result directory; an older one at the same place is replaced.
 
-    Raises
-    ------
-    BadInput
-        The place cannot be used, or the result does not hold what a directory needs.
+    BadInput: the place cannot be used, or the result does not hold what a directory needs.
     """
     if result.lp is None and not result.model_sha256:
         raise BadInput("there is no model to save: " + result.message, "out")
@@ -181,11 +178,7 @@ class Stored:
 def load(path: str | os.PathLike[str]) -> Result:
     """Read a result directory without recompiling or checking its claims.
 
-    Raises
-    ------
-    BadInput
-        The directory is unreadable, inconsistent with its problem, or its files are of several
-        saves.
+    BadInput: it is unreadable, inconsistent with its problem, or its files are of several saves.
     """
     return read(path).result
 

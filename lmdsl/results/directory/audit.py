@@ -46,14 +46,7 @@ def differences(
 ) -> list[str]:
     """Return where a certificate says something else than what was found, one sentence each.
 
-    Parameters
-    ----------
-    whole, lp
-        The recompiled model, and the part of it that a restricted result speaks of.
-    result, certificate
-        What the directory holds: the result, and all of certificate.json.
-    found
-        The claims as judged now.
+    ``whole`` is the recompiled model, ``lp`` the part of it that a restricted result speaks of.
     """
     reasons = [*_counts(lp, result), *_numbers(result, found), *_outside(lp, result)]
     claims = certificate.claims

@@ -36,10 +36,7 @@ class Mixture(BadInput):
 def read(folder: Path, what: Callable[["Reading"], T]) -> T:
     """Read the files of one save, again where another save replaced them meanwhile.
 
-    Raises
-    ------
-    BadInput
-        The directory is unreadable, or its files are of several saves.
+    BadInput: the directory is unreadable, or its files are of several saves.
     """
     if not folder.is_dir():
         raise BadInput(f"{shown(str(folder), 200)} is not a result directory")
@@ -83,10 +80,7 @@ class Reading:
     def open(self, name: str, limit: int | None = None) -> BinaryIO:
         """Return a file of this save, at its start.
 
-        Raises
-        ------
-        BadInput
-            It is missing, no regular file, of another save, or larger than ``limit`` bytes.
+        BadInput: it is missing, no regular file, of another save, or larger than ``limit`` bytes.
         """
         found, digest = self._files[name], self.digests.get(name)
         if digest is not None and not _is(found, digest, limit):

@@ -54,11 +54,7 @@ def place(path: str | os.PathLike[str]) -> Path:
 def refuse_unless_free(path: str | os.PathLike[str]) -> None:
     """Refuse a path that cannot become a result directory, before work starts.
 
-    Raises
-    ------
-    BadInput
-        The path is a file, it cannot be written, or it is a folder that holds anything and is no
-        result directory.
+    It is a file, cannot be written, or is a folder that holds anything and is no result directory.
     """
     text = shown(str(path), 200)
     try:
@@ -77,13 +73,7 @@ def refuse_unless_free(path: str | os.PathLike[str]) -> None:
 
 
 def refuse_own_file(path: str | os.PathLike[str]) -> None:
-    """Refuse to write something else in place of a file of a result directory.
-
-    Raises
-    ------
-    BadInput
-        The path, links followed, is one of a result's own files.
-    """
+    """Refuse to write something else in place of a file of a result directory, links followed."""
     target = Path(os.path.realpath(path))
     if target.name in NAMES and _marked(target.parent):
         raise BadInput(
@@ -127,19 +117,9 @@ def write(
 ) -> None:
     """Write the files of one save; what an older save left at the same place is replaced.
 
-    Parameters
-    ----------
-    target
-        The directory, which need not exist; links followed.
-    files
-        Content of every file but certificate.json.
-    commit
-        Makes certificate.json, given the keys that join it to the other files.
-
-    Raises
-    ------
-    OSError
-        The place cannot be used; the old files are still there then.
+    The directory need not exist. ``files`` are all but certificate.json, which ``commit`` makes of
+    the keys that join it to them. OSError: the place cannot be used; the old files are still there
+    then.
     """
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     target.parent.mkdir(parents=True, exist_ok=True)
