@@ -28,7 +28,7 @@ from lmdsl.optimize.policies import presolve
 from lmdsl.optimize.policies.iteration import Iteration
 
 MOST_ITERATIONS = 2**53
-"""A larger number of iterations is no count, and no number that JSON keeps."""
+"""Number of iterations above which it is no count, and no number that JSON keeps."""
 
 
 def ask(

@@ -30,6 +30,7 @@ ALGORITHMS = {
 """The factorisation of every algorithm, the default first."""
 
 TOLERANCE, LEAST_TOLERANCE = 1e-8, 1e-12
+"""The default, and the relative tolerance below which no smaller one is passed on."""
 TOLERANCES = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
 
 STOPS = {

@@ -73,7 +73,7 @@ TOLERANCE = {
 }
 """Our default and the options it sets; no default is looser than CVXPY's."""
 
-LEAST_TOLERANCE = 1e-12
+LEAST_TOLERANCE = 1e-12  # tolerance below which no smaller one is passed on
 
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:

@@ -37,6 +37,7 @@ FIXED = {
 """Options always passed."""
 
 TOLERANCE, LEAST_TOLERANCE = 1e-9, 1e-12
+"""The default, and the relative tolerance below which no smaller one is passed on."""
 ITERATIONS, MOST_ITERATIONS = 500, 2**31 - 1
 """Our limit, and the largest that Ipopt takes."""
 

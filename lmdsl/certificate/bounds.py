@@ -20,19 +20,20 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.vectors import over_cells, padded
 
 LARGEST = 2.0**1000
-"""No sum above is believed: one that rounds to infinity would be above everything."""
+"""Size of a sum above which it is not believed: one that rounds to infinity exceeds everything."""
 CLEAR, LONG = 1.0 - 1e-12, 4_000
-"""Rows of fewer than LONG entries hold where they hold with a factor CLEAR: 4,016 u < 1e-12."""
+"""Factor with which a row holds whatever rounding does; number of entries from which on it may not:
+4,016 u < 1e-12."""
 MAX_EXACT = 20_000
-"""Rows decided with exact rationals before giving up: about 0.4 s."""
+"""Number of rows above which none is decided with exact rationals: they take about 0.4 s."""
 NO_BOUNDS, NO_PAIRS = np.empty(0), np.empty(0, dtype=np.int64)
-"""No room for a result that is not asked for."""
+"""In place of arrays for results that are not asked for."""
 
 
 def expected_above(lp: StabilizationLP, policy: Pairs, x: Floats, gamma: float) -> Floats:
     """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
     upper, V = np.empty(lp.n), padded(x)
-    above = _above if tame(lp, x, gamma) else _carefully_above
+    above = _above if never_underflows(lp, x, gamma) else _carefully_above
     over_cells(lp, above, policy.view(np.uint64), lp.rows.kernel, gamma, V, upper)
     return upper
 
@@ -80,7 +81,7 @@ def holds_for_all(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | N
 def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Pairs | None:
     """Return the pairs for which x <= gamma P_a x + G_a is not clear; None if too many."""
     V = padded(x)
-    cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
+    cost, plain = np.empty(0) if cost is None else cost, never_underflows(lp, x, gamma)
 
     def part(first: int, last: int) -> tuple[int, Pairs]:
         found = np.empty(MAX_EXACT, dtype=np.int64)
@@ -116,10 +117,10 @@ def exactly_below(
 def ordinary(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> bool:
     """Return whether the fast bounds of gamma P x + G are sharp: no overflow, no underflow."""
     top = max(x.max(initial=0.0), 0.0 if cost is None else cost.max(initial=0.0))
-    return tame(lp, x, gamma) and bool(top <= LARGEST / max(gamma, 1.0))
+    return never_underflows(lp, x, gamma) and bool(top <= LARGEST / max(gamma, 1.0))
 
 
-def tame(lp: StabilizationLP, V: Floats, gamma: float) -> bool:
+def never_underflows(lp: StabilizationLP, V: Floats, gamma: float) -> bool:
     """Return whether every product gamma share V is 0 or a normal double: none underflows."""
     positive = V[V > 0]
     if not len(positive):
@@ -133,10 +134,10 @@ def worst_excess(lp: StabilizationLP, V: Floats) -> tuple[float, bool]:
 
     r_a = max(0, V - lower bound of gamma P_a V - G_a), rounded up.
     """
-    x, plain = padded(V), tame(lp, V, lp.gamma)
-    loop, room = (_open, (NO_PAIRS,)) if plain else (_carefully, (NO_BOUNDS, NO_PAIRS))
-    found = over_cells(lp, loop, *lp._kernel, lp.gamma, lp.cost, x, *room)
-    return float(max(worst for _, worst, _ in found)), any(stuck for *_, stuck in found)
+    x, plain = padded(V), never_underflows(lp, V, lp.gamma)
+    loop, unused = (_open, (NO_PAIRS,)) if plain else (_carefully, (NO_BOUNDS, NO_PAIRS))
+    found = over_cells(lp, loop, *lp._kernel, lp.gamma, lp.cost, x, *unused)
+    return float(max(worst for _, worst, _ in found)), any(infinite for *_, infinite in found)
 
 
 @kernel
@@ -213,9 +214,9 @@ def _carefully_above(first, last, policy, rows, gamma, V, upper):  # type: ignor
 
 @kernel
 def _open(first, last, pair_pointer, rows, gamma, cost, V, found):  # type: ignore[no-untyped-def]
-    """Find pairs whose bound is below V, the largest excess / cost, and if a cost of 0 has one."""
+    """Find pairs whose bound is below V, the largest excess / cost, and if it is infinite."""
     pointer, target, code, share = rows
-    count, worst, stuck = 0, 0.0, False
+    count, worst, infinite = 0, 0.0, False
     for i in range(np.uint64(first), np.uint64(last)):
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
             g = cost[k] if len(cost) else 0.0
@@ -235,14 +236,14 @@ def _open(first, last, pair_pointer, rows, gamma, cost, V, found):  # type: igno
                     ratio = excess / g * (1.0 + 4.0 * UNIT)
                     worst = ratio if ratio > worst else worst
                 else:
-                    stuck = True
-    return count, worst, stuck
+                    infinite = True
+    return count, worst, infinite
 
 
 @kernel
 def _carefully(first, last, pair_pointer, rows, gamma, cost, V, lower, found):  # type: ignore[no-untyped-def]
     """All that :func:`_below` and :func:`_open` find out, minding underflow."""
-    count, worst, stuck = 0, 0.0, False
+    count, worst, infinite = 0, 0.0, False
     for i in range(np.uint64(first), np.uint64(last)):
         best = np.inf
         for k in range(pair_pointer[i], pair_pointer[i + ONE]):
@@ -258,7 +259,7 @@ def _carefully(first, last, pair_pointer, rows, gamma, cost, V, lower, found):  
                     ratio = excess / g * (1.0 + 4.0 * UNIT)
                     worst = ratio if ratio > worst else worst
                 else:
-                    stuck = True
+                    infinite = True
         if len(lower):
             lower[i] = best
-    return count, worst, stuck
+    return count, worst, infinite

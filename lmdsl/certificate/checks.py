@@ -10,10 +10,10 @@ from lmdsl.certificate.sums import rounded_up, total_above
 from lmdsl.common.types import Floats, Pairs
 from lmdsl.model.lp import StabilizationLP
 
-MEASURE_TOLERANCE = 1e-9
+MEASURE_TOLERANCE = 1e-9  # residual of mu relative to its size above which it is refused
 
 MOST_EXACT = 200_000
-"""Transitions of a policy that are judged exactly where numbers are extreme: 0.5 s a claim."""
+"""Number of transitions of a policy above which none is judged exactly: 0.5 s a claim."""
 
 
 def check_stabilizing(lp: StabilizationLP, policy: Pairs, w: Floats) -> float | None:

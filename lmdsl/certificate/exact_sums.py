@@ -14,7 +14,7 @@ from lmdsl.model.lp import StabilizationLP
 
 Row = list[tuple[int, int]]
 
-BLOCK = 2**14
+BLOCK = 2**14  # number of rows that are read at a time
 
 
 def rows(

@@ -15,8 +15,8 @@ from lmdsl.machine import threads
 from lmdsl.model.algorithm_1 import reaches_attractor
 from lmdsl.model.lp import StabilizationLP
 
-MANY = 10_000
-"""Cells from which on two claims are judged in two threads."""
+PARALLEL_FROM = 10_000
+"""Number of cells from which on two claims are judged in two threads."""
 
 
 class About(Enum):
@@ -136,11 +136,11 @@ def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certific
     half = len(first) - len(first) // 2
     found: dict[str, Found] = {}
     for part in threads.both(
-        lambda: judged(*first[:half]), lambda: judged(*first[half:]), lp.n >= MANY
+        lambda: judged(*first[:half]), lambda: judged(*first[half:]), lp.n >= PARALLEL_FROM
     ):
         found |= part
     found |= judged(*(claim for claim in asked if claim not in first))
-    known = _held(found, UPPER_BOUND) and _held(found, LOWER_BOUND)
+    known = _holds(found, UPPER_BOUND) and _holds(found, LOWER_BOUND)
     gap = checks.gap(lp, witness.V_up, witness.W) if known else None
     return _certificate(lp, policy, found, gap, tolerance)
 
@@ -166,7 +166,7 @@ def exact_verdict(
         for claim in _asked(policy)
         if claim.vector in vectors
     }
-    known = _held(found, UPPER_BOUND) and _held(found, LOWER_BOUND)
+    known = _holds(found, UPPER_BOUND) and _holds(found, LOWER_BOUND)
     gap = exact_checks.gap(lp, vectors["V_up"], vectors["W"]) if known else None
     return _certificate(lp, policy, found, gap, tolerance)
 
@@ -181,7 +181,7 @@ def _asked(policy: Pairs | None) -> list[Claim]:
     return [claim for claim in CLAIMS if claim.about is not other]
 
 
-def _held(found: Mapping[str, Found], claim: Claim) -> bool:
+def _holds(found: Mapping[str, Found], claim: Claim) -> bool:
     return found.get(claim.name, NOTHING).holds
 
 
@@ -193,7 +193,7 @@ def _certificate(
     tolerance: float,
 ) -> Certificate:
     """Return what was found, with the reasons why it is not verified."""
-    holds = {claim.name: _held(found, claim) for claim in CLAIMS}
+    holds = {claim.name: _holds(found, claim) for claim in CLAIMS}
     numbers = {
         claim.number: found.get(claim.name, NOTHING).number for claim in CLAIMS if claim.number
     }

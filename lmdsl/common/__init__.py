@@ -1,1 +1,1 @@
-"""What every room uses and no control engineer needs to know: files, strict models, inputs."""
+"""What every package uses and no control engineer needs to know: files, strict models, inputs."""

@@ -11,7 +11,7 @@ from lmdsl.common.files import joined
 from lmdsl.errors import BadInput, shown
 
 MOST_CHARACTERS = 900
-"""Length of a message; what is left out then is counted."""
+"""Number of characters of a message above which further faults are counted only."""
 
 _FIXES = {
     "bool_type": "write true or false",

@@ -12,9 +12,9 @@ from typing import Any, BinaryIO
 
 from lmdsl.errors import BadInput, shown
 
-MAX_FILE_BYTES = 16 * 2**20
-MAX_NESTING = 32
-MAX_ITEMS = 1_000_000
+MAX_FILE_BYTES = 16 * 2**20  # number of bytes above which a file is refused
+MAX_NESTING = 32  # depth of JSON above which it is refused
+MAX_ITEMS = 1_000_000  # number of values in JSON above which it is refused
 
 
 def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:

@@ -11,7 +11,7 @@ from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput, shown
 
 MOST = 10**15
-"""The largest count that is accepted: exact as a double, and more than anybody waits for."""
+"""Number above which a count is refused: exact as a double, and more than can ever be done."""
 
 
 def whole(value: Any, where: str, least: int = 1, most: float = MOST) -> int:

@@ -1,4 +1,4 @@
-"""Names of types that every room uses: arrays by what they hold, and callables of the caller's."""
+"""Names of types for every package: arrays by what they hold, and callables of the caller's."""
 
 from collections.abc import Callable
 

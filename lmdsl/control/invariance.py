@@ -23,13 +23,13 @@ from lmdsl.model.local.controller import LocalController
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 
-SAMPLES, FEWEST = 10_000, 10
-SAMPLED_WORK = 1e10  # additions that take as long as all samples: some seconds
+SAMPLES, FEWEST = 10_000, 10  # largest and least number of samples
+SAMPLED_WORK = 1e10  # number of additions above which fewer samples are taken: some seconds
 CHUNK = 8192  # cells enclosed at a time
-WORK = 2e7  # most operations on boxes that an enclosure may take: some seconds
+WORK = 2e7  # number of operations on boxes above which no cell is enclosed any more: seconds
 OVERHEAD = 1000  # boxes whose arithmetic costs as much as NumPy's own work for an operation
-ROUNDS = 14  # most halvings of an axis
-MEETS = 512  # most cells that the image of a box may meet
+ROUNDS = 14  # number of halvings of an axis above which a box is given up
+MEETS = 512  # number of cells that an image meets above which nothing is claimed of it
 DOING = "checking the local controller"
 
 
@@ -188,29 +188,29 @@ def _kept(
     unless its centre is mapped outside: then its cell is lost.
     """
     partition, guard = local.partition, partial(deadline.raise_if_over, DOING)
-    (low, high, home), work = partition.domain(cells), 0.0
+    (low, high, owner), work = partition.domain(cells), 0.0
     lost = np.zeros(len(cells), dtype=np.bool_)
     for _ in range(ROUNDS * partition.dimension):
-        work += len(home) + OVERHEAD
-        if not len(home) or work > limit:
+        work += len(owner) + OVERHEAD
+        if not len(owner) or work > limit:
             break
-        inside = np.ones(len(home), dtype=np.bool_)
+        inside = np.ones(len(owner), dtype=np.bool_)
         with np.errstate(all="ignore"):
             for node in nodes:
                 guard()
-                images = _images(true_map, local, cells[home], low, high, node, guard)
+                images = _images(true_map, local, cells[owner], low, high, node, guard)
                 inside &= _into(partition, local.attractor, images)
         centre = low / 2 + high / 2
-        lost[home[~_stays(true_map, local, centre, cells[home], nodes, deadline)]] = True
-        open_ = ~inside & ~lost[home]
-        low, high, home = low[open_], high[open_], home[open_]
+        lost[owner[~_stays(true_map, local, centre, cells[owner], nodes, deadline)]] = True
+        open_ = ~inside & ~lost[owner]
+        low, high, owner = low[open_], high[open_], owner[open_]
         axis = np.argmax((high - low) / partition.width, axis=1)
-        rows = np.arange(len(home))
+        rows = np.arange(len(owner))
         upper, lower = low.copy(), high.copy()
         upper[rows, axis] = lower[rows, axis] = (low[rows, axis] + high[rows, axis]) / 2
         low, high = np.concatenate([low, upper]), np.concatenate([lower, high])
-        home = np.concatenate([home, home])
-    lost[home] = True
+        owner = np.concatenate([owner, owner])
+    lost[owner] = True
     return int((~lost).sum()), work
 
 

@@ -13,7 +13,7 @@ from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 
 FEW = 0.01
-"""Share of the runs that may miss the attractor before the samples are called too few."""
+"""Share of runs that miss the attractor above which the samples are called too few."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,8 +35,8 @@ from lmdsl.model.grid import boxes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 
-SMALL = 1e-6
-MOST_CELLS = 100
+SMALL = 1e-6  # share of the mass up to which a loss counts as none
+MOST_CELLS = 100  # number of cells above which only the largest losses are listed
 BYTES = 150
 """Bytes per entry of the LP: SciPy's copies and the factors of HiGHS, roughly."""
 

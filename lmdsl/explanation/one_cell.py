@@ -20,8 +20,8 @@ from lmdsl.model.stabilizable_set import CellStatus
 NAMES = {status: status.name.lower().replace("_", " ") for status in CellStatus}
 """The causes as words: "escapes", "trapped", "leads to these", ..."""
 
-MOST_CONTROLS = 32
-MOST_BOXES = 8
+MOST_CONTROLS = 32  # number of controls above which only some are shown, evenly chosen
+MOST_BOXES = 8  # number of boxes above which a trap is shown in part
 Named = dict[str, float]
 
 
@@ -57,8 +57,8 @@ class Move(Frozen):
     cause: str | None = None
 
     def __str__(self) -> str:
-        held = _shown(self.control)
-        start = f"{held} loses" if held else "it loses"
+        control = _shown(self.control)
+        start = f"{control} loses" if control else "it loses"
         sample = (
             f"{start} {100 * self.share:.3g} % of the samples: "
             f"{_shown({**self.state, **self.noise})} goes to {_shown(self.image)}"

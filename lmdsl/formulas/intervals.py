@@ -26,7 +26,7 @@ TINY: Final = 2.0**-1070
 
 _FUNCTION: Final = (4 * FUNCTION_ULPS + 2) * ROUNDING  # a unit is at most 2 ROUNDING of the value
 _TOP: Final = 1.0 + _FUNCTION  # so far a computed sine may go
-_LARGE: Final = 1e8  # beyond it, where in its period an argument lies is not worth finding out
+_LARGE: Final = 1e8  # argument above which it is not found out where in its period it lies
 
 
 class Interval(NamedTuple):

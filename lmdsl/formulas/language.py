@@ -34,10 +34,10 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.operations import _COMPARISONS, FORMULA_CONSTANTS, FORMULA_FUNCTIONS, OPERATIONS
 from lmdsl.formulas.tokens import Token, fault_at, scan
 
-MAX_CHARACTERS: Final = 4_000
-MAX_NODES: Final = 1_000
-MAX_DEPTH: Final = 50
-MAX_NAME: Final = 64
+MAX_CHARACTERS: Final = 4_000  # number of characters above which a formula is refused
+MAX_NODES: Final = 1_000  # number of subformulas above which it is refused
+MAX_DEPTH: Final = 50  # depth above which it is refused
+MAX_NAME: Final = 64  # number of characters above which a name is refused
 
 _COMPARE, _SUM, _PRODUCT, _POWER = 1, 2, 3, 4
 _RANK: Final = dict.fromkeys(_COMPARISONS, _COMPARE) | dict(

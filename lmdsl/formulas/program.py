@@ -102,11 +102,11 @@ class Program:
             in_place = instruction.operation in PLAIN
             reusable = tuple(k for k in released if in_place and k not in inputs)
             marked.append(instruction._replace(released=released, reusable=reusable))
-        held = self.live = 0
+        alive = self.live = 0
         for instruction in reversed(marked):
-            held += 1
-            self.live = max(self.live, held + 1)  # an operation may need one more for itself
-            held -= sum(k not in inputs for k in instruction.released)
+            alive += 1
+            self.live = max(self.live, alive + 1)  # an operation may need one more for itself
+            alive -= sum(k not in inputs for k in instruction.released)
         return marked[::-1]
 
     def part(self, outputs: Sequence[int]) -> "Program":
@@ -142,8 +142,8 @@ class Program:
                 if guard is not None:
                     guard()
                 operands = [slots[k] for k in places]
-                room = _room(operands, [slots[k] for k in reusable]) if reusable else {}
-                slots[target] = OPERATIONS[operation](*operands, **room)
+                buffer = _buffer(operands, [slots[k] for k in reusable]) if reusable else {}
+                slots[target] = OPERATIONS[operation](*operands, **buffer)
                 for k in released:
                     slots[k] = None
         aliases = set(self.variables.values())
@@ -193,7 +193,7 @@ def _needed(instructions: Sequence[Instruction], outputs: Sequence[int]) -> list
     return kept[::-1]
 
 
-def _room(operands: list[Any], reusable: list[Any]) -> dict[str, Any]:
+def _buffer(operands: list[Any], reusable: list[Any]) -> dict[str, Any]:
     """Return ``out=`` with a reusable array that already has the shape of the result."""
     for array in reusable:
         fits = isinstance(array, np.ndarray) and np.broadcast(*operands).shape == array.shape

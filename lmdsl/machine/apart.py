@@ -22,7 +22,8 @@ from lmdsl.machine.deadline import Deadline
 T = TypeVar("T")
 
 LARGE = 50_000
-"""Entries of a matrix above which native calls may take longer than anybody wants to wait."""
+"""Number of entries of a matrix from which on native calls have a process of their own, with or
+without a deadline."""
 
 GRACE = 1.0
 """Seconds after the deadline in which a solver may still say what it found."""

@@ -16,7 +16,7 @@ class TimeLimitReached(LmdslError, TimeoutError):
 
 
 FOREVER = 1e10
-"""Seconds after which no limit matters: three centuries."""
+"""Number of seconds above which a limit counts as this one: three centuries."""
 
 
 class Deadline:
@@ -58,7 +58,7 @@ class Deadline:
 
     @property
     def left(self) -> float | None:
-        """Seconds that are left, positive however late; None for no limit."""
+        """Seconds that are left, positive even after it; None for no limit."""
         return None if self._at == math.inf else max(self._at - time.monotonic(), 1e-9)
 
     def raise_if_over(self, doing: str) -> None:

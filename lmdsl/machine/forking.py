@@ -28,7 +28,7 @@ def forked() -> bool:
 whole = threading.RLock()
 """Held while parts of lmdsl are imported: Python keeps a lock for each module."""
 
-_held: list[Any] = [whole]
+_locks: list[Any] = [whole]
 _taken: list[Any] = []
 
 
@@ -37,11 +37,11 @@ def hold(lock: Any) -> None:
 
     Who holds the lock may not import parts of lmdsl; who imports them may take it.
     """
-    _held.append(lock)
+    _locks.append(lock)
 
 
 def _before() -> None:
-    for lock in _held:
+    for lock in _locks:
         lock.acquire()
         _taken.append(lock)
 

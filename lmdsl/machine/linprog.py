@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-TIGHT = 1e-9
+TIGHT = 1e-9  # violation of a constraint or of dual feasibility above which HiGHS goes on
 
 
 def solved(

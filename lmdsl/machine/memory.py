@@ -14,39 +14,39 @@ from typing import NamedTuple
 
 from lmdsl.errors import BadInput
 
-TRIFLE = 2**24  # bytes that need no asking
+SMALL = 2**24  # number of bytes above which it is asked whether they are there
 UNKNOWN = 8 * 2**30  # where the operating system does not say
 UNLIMITED = 2**60  # version 1 writes its largest number of pages
 
 
-class Room(NamedTuple):
+class Memory(NamedTuple):
     """Bytes that may still be used, and what says so."""
 
     bytes: int
     limit: str
 
 
-def available(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> Room:
+def available(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> Memory:
     """Return the tightest limit; ``root`` holds ``proc`` and ``sys``, ``environ`` names Slurm."""
-    rooms = [_free(root), *_groups(root), *_ulimits(root), *_slurm(root, environ)]
-    least = min(rooms)
-    return Room(max(least.bytes, 0), least.limit)
+    limits = [_free(root), *_groups(root), *_ulimits(root), *_slurm(root, environ)]
+    least = min(limits)
+    return Memory(max(least.bytes, 0), least.limit)
 
 
 def fits(estimate: float) -> bool:
     """Return whether so many bytes are available."""
-    return estimate <= TRIFLE or estimate <= available().bytes
+    return estimate <= SMALL or estimate <= available().bytes
 
 
 def require(estimate: float, what: str) -> None:
     """Refuse work whose estimate exceeds the available memory, before any of it is taken."""
-    if estimate <= TRIFLE:
+    if estimate <= SMALL:
         return
-    room = available()
-    if estimate > room.bytes:
+    free = available()
+    if estimate > free.bytes:
         raise BadInput(
-            f"the problem needs about {human(estimate)} of memory ({what}) and {human(room.bytes)} "
-            f"are available ({room.limit}); use fewer cells, controls or sample points"
+            f"the problem needs about {human(estimate)} of memory ({what}) and {human(free.bytes)} "
+            f"are available ({free.limit}); use fewer cells, controls or sample points"
         )
 
 
@@ -78,16 +78,16 @@ def _table(path: Path) -> dict[str, int]:
     return {name: int(number) for name, number in found}
 
 
-def _free(root: Path) -> Room:
+def _free(root: Path) -> Memory:
     free = _table(root / "proc/meminfo").get("MemAvailable")
     if free is not None:
-        return Room(free * 1024, "free memory")
+        return Memory(free * 1024, "free memory")
     with contextlib.suppress(OSError, ValueError, AttributeError):
-        return Room(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") * 3 // 4, "memory")
-    return Room(UNKNOWN, "memory not known")
+        return Memory(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") * 3 // 4, "memory")
+    return Memory(UNKNOWN, "memory not known")
 
 
-def _groups(root: Path) -> Iterator[Room]:
+def _groups(root: Path) -> Iterator[Memory]:
     """Yield what the control groups of this process and the groups around them leave."""
     places = {}  # of version 1 (its memory controller) and version 2: what is mounted where
     for line in _lines(root / "proc/self/mountinfo"):
@@ -115,7 +115,7 @@ def _groups(root: Path) -> Iterator[Room]:
                     break
 
 
-def _group(group: Path, name: str, one: bool) -> Iterator[Room]:
+def _group(group: Path, name: str, one: bool) -> Iterator[Memory]:
     names = ("memory.limit_in_bytes",) if one else ("memory.max", "memory.high")
     used = _number(group / ("memory.usage_in_bytes" if one else "memory.current")) or 0
     table = _table(group / "memory.stat")
@@ -126,10 +126,10 @@ def _group(group: Path, name: str, one: bool) -> Iterator[Room]:
         limits.append(table.get("hierarchical_memory_limit"))
     for limit in limits:
         if limit is not None and limit < UNLIMITED:
-            yield Room(limit - max(used - files, 0), name)
+            yield Memory(limit - max(used - files, 0), name)
 
 
-def _ulimits(root: Path) -> Iterator[Room]:
+def _ulimits(root: Path) -> Iterator[Memory]:
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -140,10 +140,10 @@ def _ulimits(root: Path) -> Iterator[Room]:
         ):
             soft, _ = resource.getrlimit(limit)
             if soft != resource.RLIM_INFINITY:
-                yield Room(soft - used.get(counted, 0) * 1024, name)
+                yield Memory(soft - used.get(counted, 0) * 1024, name)
 
 
-def _slurm(root: Path, environ: Mapping[str, str]) -> Iterator[Room]:
+def _slurm(root: Path, environ: Mapping[str, str]) -> Iterator[Memory]:
     """Yield what a Slurm job leaves, which may be enforced by ending it."""
     used = _table(root / "proc/self/status").get("VmRSS", 0) * 1024
     for per, counts in (
@@ -157,4 +157,4 @@ def _slurm(root: Path, environ: Mapping[str, str]) -> Iterator[Room]:
         shares = (re.search(r"\d+", environ.get(name, "")) for name in counts)
         count = next((int(share[0]) for share in shares if share), 1)
         unit = 2 ** (10 * (1 + "KMGT".index(found[2].upper() or "M")))
-        yield Room(int(found[1]) * unit * count - used, f"SLURM_MEM_PER_{per}")
+        yield Memory(int(found[1]) * unit * count - used, f"SLURM_MEM_PER_{per}")

@@ -20,7 +20,7 @@ from typing import Any
 from lmdsl.machine import forking
 
 KEPT = 65_536
-"""Bytes of a log that are kept, the last ones."""
+"""Number of bytes of a log above which only the last ones are kept."""
 
 _lock = threading.RLock()
 _turn = threading.RLock()

@@ -83,9 +83,11 @@ def each(work: Callable[[Part], Outcome], parts: Sequence[Part]) -> list[Outcome
     return [outcomes[k] for k in range(len(parts))]
 
 
-def both(one: Callable[[], First], other: Callable[[], Second], pays: bool) -> tuple[First, Second]:
-    """Return ``(one(), other())``, each in a thread of its own where that ``pays``."""
-    if not pays:
+def both(
+    one: Callable[[], First], other: Callable[[], Second], parallel: bool
+) -> tuple[First, Second]:
+    """Return ``(one(), other())``, each in a thread of its own if ``parallel``."""
+    if not parallel:
         return one(), other()
     found: list[Any] = each(lambda work: work(), (one, other))
     return found[0], found[1]

@@ -73,13 +73,13 @@ def tree(
 
 
 PATIENCE = 8
-"""Visits per entry that sweeps may cost before predecessors are made: these cost about as much."""
+"""Number of visits per entry above which predecessors are made: they cost about as much."""
 
 PARTS = 16
-"""Ranges of cells that threads work on."""
+"""Number of ranges of cells that threads work on."""
 
-SMALL = 2**20
-"""Entries of rows below which one thread is fastest."""
+PARALLEL_FROM = 2**20
+"""Number of entries of rows from which on ranges of cells are searched in threads."""
 
 
 def _tree(
@@ -91,7 +91,7 @@ def _tree(
     level[cells] = 0
     pair = np.full(cells, -1, dtype=np.int64)
     front = level == 0
-    parts = 1 if len(rows.target) < SMALL else PARTS
+    parts = 1 if len(rows.target) < PARALLEL_FROM else PARTS
     spans = threads.ranges(cells, parts)
     left = 0 if before else PATIENCE * len(rows.target)
     below = 0

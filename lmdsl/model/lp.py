@@ -286,10 +286,10 @@ def compile(  # noqa: A001
     inputs.kind(problem, Problem, "problem", "a Problem")
     partition = Partition.of(problem)
     require_least(problem)
-    patient = unless_short(problem, deadline)
+    limit = unless_short(problem, deadline)
     if problem.local_controller is not None:  # refuse a wrong one before the work
-        attractor = CellSets.of(problem, partition, patient).attractor
-        LocalController.of(problem, partition, attractor, patient)
+        attractor = CellSets.of(problem, partition, limit).attractor
+        LocalController.of(problem, partition, attractor, limit)
     transitions = assemble(problem, partition, progress, deadline)
     sets = transitions.sets
     found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)

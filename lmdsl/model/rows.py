@@ -23,8 +23,8 @@ from lmdsl.machine import threads
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.discretization import Nodes
 
-PARTS, MANY = 8, 10_000
-"""Ranges into which rows are split for threads, and how many rows are worth it."""
+PARTS, PARALLEL_FROM = 8, 10_000
+"""Number of ranges for threads, and number of rows from which on they are made."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,8 +147,8 @@ class Rows(Frozen):
 
 
 def over_rows(count: int, loop: Callable[..., object], *arguments: Any) -> None:
-    """Call ``loop(first, last, *arguments)`` on ranges of so many rows, in threads if it pays."""
-    ranges = threads.ranges(count, PARTS if count >= MANY else 1)
+    """Call ``loop(first, last, *arguments)`` on ranges of rows, in threads where they are many."""
+    ranges = threads.ranges(count, PARTS if count >= PARALLEL_FROM else 1)
     threads.each(lambda span: loop(*span, *arguments), ranges)
 
 

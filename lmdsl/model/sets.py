@@ -21,7 +21,7 @@ CELL = 32
 """Bytes of a cell while the sets are made."""
 
 PART = 2**16
-"""Cells of which the density is evaluated at a time."""
+"""Number of cells of which the density is evaluated at a time."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from lmdsl.model.lp import StabilizationLP
 
 T = TypeVar("T")
 
-GRAIN = 500_000
-"""Transitions that are worth a thread."""
+TRANSITIONS_A_RANGE = 500_000
+"""Number of transitions above which another range of cells, and thread, is worth it."""
 
 
 def padded(V: Floats) -> Floats:
@@ -27,5 +27,5 @@ def over_cells(
 
     The ranges, ``most`` at most, do not depend on the number of threads; nor do the results.
     """
-    count = max(1, min(len(lp.rows.target) // GRAIN, most, lp.n))
+    count = max(1, min(len(lp.rows.target) // TRANSITIONS_A_RANGE, most, lp.n))
     return threads.each(lambda cells: loop(*cells, *arguments), threads.ranges(lp.n, count))

@@ -9,8 +9,8 @@ from lmdsl.certificate.bounds import (
     _carefully,
     _plain,
     exact_backup,
+    never_underflows,
     ordinary,
-    tame,
     undecided,
 )
 from lmdsl.certificate.sums import UNIT as UNIT
@@ -29,9 +29,9 @@ def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | No
         least: Floats = improve(lp, x, gamma, np.zeros(lp.K)).value
         return least * (1 - terms * UNIT) * (1 - 4 * UNIT)
     lower, V = np.empty(lp.n), padded(x)
-    cost, plain = np.empty(0) if cost is None else cost, tame(lp, x, gamma)
-    loop, room = (_below, ()) if plain else (_carefully, (NO_PAIRS,))
-    over_cells(lp, loop, *lp._kernel, gamma, cost, V, lower, *room)
+    cost, plain = np.empty(0) if cost is None else cost, never_underflows(lp, x, gamma)
+    loop, unused = (_below, ()) if plain else (_carefully, (NO_PAIRS,))
+    over_cells(lp, loop, *lp._kernel, gamma, cost, V, lower, *unused)
     return lower
 
 

@@ -18,7 +18,7 @@ from lmdsl.certificate.checks import (
     weighted,
 )
 from lmdsl.certificate.claims import Verified, Witness
-from lmdsl.certificate.judge import MANY, verdict
+from lmdsl.certificate.judge import PARALLEL_FROM, verdict
 from lmdsl.common.types import Floats, Pairs, TimeUp, never
 from lmdsl.machine import threads
 from lmdsl.machine.deadline import Stopped
@@ -28,13 +28,13 @@ from lmdsl.optimize.linear import equations
 from lmdsl.optimize.linear.substitution import Peeled
 from lmdsl.optimize.policies import evaluation, iteration
 
-MOST_GUESSED = 1e-7
+MOST_GUESSED = 1e-7  # relative slack above which a lower bound is not made by scaling V
 
 LEAST_PASSES, MOST_PASSES, MOST_READ = 100, 2000, 2 * 10**8
-"""Passes from 0 towards the lower bound, and how many transitions they may read in all."""
+"""Number of passes towards the lower bound, and of transitions read above which they end."""
 
 RELATIVE_SLACK = (1e-13, 1e-11, 1e-9)
-"""Near gamma_bar an absolute slack drowns in the rounding of large values. The value at
+"""Near gamma_bar rounding of large values exceeds an absolute slack. The value at
 gamma (1 + s) leaves a slack s gamma P V relative to V above; the optimum at gamma (1 - s) below."""
 
 
@@ -84,7 +84,7 @@ def _first_try(
         return _measure_vector(under, rows, time_up)
 
     if value is not None:  # then the Lyapunov measure is finite too
-        (witness, V), mu = threads.both(bounds_of_cost, lyapunov_measure, lp.n >= MANY)
+        (witness, V), mu = threads.both(bounds_of_cost, lyapunov_measure, lp.n >= PARALLEL_FROM)
     else:
         witness, V = bounds_of_cost()
         mu = None if V is None else lyapunov_measure()
@@ -189,15 +189,15 @@ def _guessed(under: StabilizationLP, V: Floats, tolerance: float) -> Floats | No
 
     Other rows as close to V have about as many entries and as much cost.
     """
-    worst, stuck = bounds.worst_excess(under, V)
+    worst, infinite = bounds.worst_excess(under, V)
     eps = 2 * worst + bounds.UNIT
-    return None if stuck or not eps < min(tolerance / 4, MOST_GUESSED) else V * (1 - eps)
+    return None if infinite or not eps < min(tolerance / 4, MOST_GUESSED) else V * (1 - eps)
 
 
 def _scaled(lp: StabilizationLP, V: Floats) -> Floats | None:
     """W = (1 - eps) V: it serves once r_a <= eps/(1 - eps) G_a for every surviving pair."""
-    worst, stuck = bounds.worst_excess(lp, V)
-    if stuck or not worst < 1:
+    worst, infinite = bounds.worst_excess(lp, V)
+    if infinite or not worst < 1:
         return None
     for margin in (1.0, 2.0, 16.0):
         eps = margin * worst / (1 + worst) + (margin - 1) * 1e-15

@@ -36,7 +36,7 @@ REGIONS: dict[int, tuple[str, str, str | None]] = {
 """Region: name, colour, hatch; greys are cells that cannot be stabilized, by cause."""
 
 MOST_RUNS = 5_000
-"""Runs of cells that a region is drawn with; beyond, it is an image and has no hatch."""
+"""Number of runs of cells above which a region is drawn as an image, without hatch."""
 
 
 def blank(columns: float = 1, rows: float = 1) -> Any:
@@ -233,8 +233,8 @@ def levels(ax: Any, view: View, values: Floats, grid: Floats, label: str) -> Non
     """Draw a quantity that takes the values of a grid, centred at 0 when it has both signs."""
     if len(view.axes) == 1:
         _steps(ax, view, values, label)
-        room = 0.06 * float(np.ptp(grid)) or 0.5
-        ax.set_ylim(grid.min() - room, grid.max() + room)
+        margin = 0.06 * float(np.ptp(grid)) or 0.5
+        ax.set_ylim(grid.min() - margin, grid.max() + margin)
         ax.axhline(0, color=FAINT, linewidth=0.7, zorder=0.6)
         return
     import matplotlib

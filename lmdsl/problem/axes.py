@@ -9,7 +9,7 @@ from lmdsl.common.strict_model import Count, Declared, Number, frozen_dict, plai
 from lmdsl.errors import BadInput
 from lmdsl.formulas.names import named_keys, valid_names
 
-MAX_AXES = 16
+MAX_AXES = 16  # number of axes above which a problem is refused
 
 
 class Axis(Declared):

@@ -9,7 +9,7 @@ from lmdsl.common.strict_model import Declared, Number, Numbers, Positive, froze
 from lmdsl.problem.sets import Point
 from lmdsl.problem.unions import kinds
 
-MAX_ORBIT = 64
+MAX_ORBIT = 64  # number of points above which an orbit is refused
 
 NamedNumbers = Annotated[dict[str, Number], BeforeValidator(plain), frozen_dict]
 

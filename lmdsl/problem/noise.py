@@ -12,7 +12,7 @@ from lmdsl.errors import BadInput
 from lmdsl.formulas.names import named_keys, valid_names
 from lmdsl.problem.unions import EachWords, tag_by_key
 
-MAX_HERMITE = 64
+MAX_HERMITE = 64  # number of nodes above which a quadrature is refused
 
 
 class NoiseValues(Declared):

@@ -10,7 +10,7 @@ from lmdsl.errors import BadInput
 from lmdsl.formulas.names import FormulaText
 from lmdsl.problem.unions import EachWords
 
-MAX_BOXES = 10_000
+MAX_BOXES = 10_000  # number of boxes, points or cells above which a set is refused
 
 Point = Annotated[
     Annotated[tuple[Number, ...], Tag("<a>")]

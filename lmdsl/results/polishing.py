@@ -51,7 +51,7 @@ def _polish(
     left as it is: a limit is not a license to go on.
     """
     if iteration is not None and solution.stop.success:  # it ends where polishing would begin
-        return _tidied(lp, iteration, tolerance, 0, None, deadline)
+        return _ties_broken(lp, iteration, tolerance, 0, None, deadline)
     policy = _claimed(lp, solution)
     if policy is not None and not _usable(lp, policy, solution.value):
         policy = None
@@ -70,10 +70,10 @@ def _polish(
     gap_before = None
     if done.steps:
         gap_before = certify(lp, policy, tolerance, value, deadline.again()).certificate.gap
-    return _tidied(lp, done, tolerance, done.steps, gap_before, deadline)
+    return _ties_broken(lp, done, tolerance, done.steps, gap_before, deadline)
 
 
-def _tidied(
+def _ties_broken(
     lp: StabilizationLP,
     done: Iteration,
     tolerance: float,
@@ -83,14 +83,14 @@ def _tidied(
 ) -> _Outcome:
     """Break ties; where that costs more than the tolerance the strict minimisers stay."""
     try:
-        tidy = ties.canonical(lp, done.policy, done.value, done.screen, deadline)
+        canonical = ties.canonical(lp, done.policy, done.value, done.screen, deadline)
     except Stopped:
-        tidy = done.policy
-    if (tidy != done.policy).any() and _usable(lp, tidy, done.value):
-        tidy_value = evaluation.evaluate(lp, tidy, start=done.value, transient=lp.gamma >= 1)
+        canonical = done.policy
+    if (canonical != done.policy).any() and _usable(lp, canonical, done.value):
+        bound = evaluation.evaluate(lp, canonical, start=done.value, transient=lp.gamma >= 1)
         limit = (1 + tolerance / 4) * checks.weighted(lp, done.value)
-        if tidy_value is not None and checks.weighted(lp, tidy_value) <= limit:
-            return _Outcome(tidy, tidy_value, steps, gap_before)
+        if bound is not None and checks.weighted(lp, bound) <= limit:
+            return _Outcome(canonical, bound, steps, gap_before)
     value = done.value if done.converged else None  # else perhaps only a bound of it
     return _Outcome(done.policy, value, steps, gap_before)
 

@@ -27,7 +27,7 @@ from lmdsl.results.polishing import _Outcome, _polish
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause
 
-TOLERANCE = 1e-6
+TOLERANCE = 1e-6  # default gap above which a result is not verified
 
 
 @own_arithmetic
@@ -81,7 +81,7 @@ def solve(
     require_all = inputs.flag(require_all, "require_all")
     restrict_to_gamma = inputs.flag(restrict_to_gamma, "restrict_to_gamma")
     chosen, algorithm = backends.resolve(backend)
-    wishes = _Wishes(
+    request = _Request(
         backend=chosen,
         algorithm=algorithm,
         name=backend if isinstance(backend, str) else chosen.name,
@@ -93,17 +93,17 @@ def solve(
         progress=progress,
     )
     if isinstance(problem, StabilizationLP):
-        return _answer(problem, wishes)
+        return _answer(problem, request)
     started = time.perf_counter()
     try:
-        lp = compile(problem, progress, wishes.deadline)
+        lp = compile(problem, progress, request.deadline)
     except TimeLimitReached as error:
         return not_compiled(backend, problem, tolerance, error, time.perf_counter() - started)
-    return _answer(lp, wishes, time.perf_counter() - started)
+    return _answer(lp, request, time.perf_counter() - started)
 
 
 @dataclass(frozen=True)
-class _Wishes:
+class _Request:
     """What the caller of :func:`solve` asks for."""
 
     backend: Backend
@@ -122,45 +122,45 @@ class _Wishes:
             self.progress(stage, -1.0)
 
 
-def _answer(lp: StabilizationLP, wishes: _Wishes, compile_seconds: float | None = None) -> Result:
+def _answer(lp: StabilizationLP, request: _Request, compile_seconds: float | None = None) -> Result:
     """Find a policy of a compiled problem, and the proof of it or against any."""
-    deadline = wishes.deadline
-    job = _Job(lp, wishes.name, wishes.tolerance, compile_seconds)
-    refused = _not_stabilizable(lp, wishes.require_all)
+    deadline = request.deadline
+    job = _Job(lp, request.name, request.tolerance, compile_seconds)
+    refused = _not_stabilizable(lp, request.require_all)
     job.finish = deadline.again()
     if refused:
         return job.refused(*refused)
     started = time.perf_counter()
     first = first_policy.stabilizing(lp, deadline)
     if isinstance(first, first_policy.Refused):
-        infeasible = _infeasible(lp, first, wishes, job, started)
+        infeasible = _infeasible(lp, first, request, job, started)
         if infeasible is not None:
             return infeasible
         first = first_policy.Undecided(first.best.policy, first.lower)
-    solution, outcome = _asked(lp, first, wishes, job)
+    solution, outcome = _asked(lp, first, request, job)
     job.solve_seconds = time.perf_counter() - started
-    wishes.tell("verify")
+    request.tell("verify")
     started = time.perf_counter()
     job.finish = deadline.again()
-    verified = certify(lp, outcome.policy, wishes.tolerance, outcome.value, job.finish)
+    verified = certify(lp, outcome.policy, request.tolerance, outcome.value, job.finish)
     job.verify_seconds = time.perf_counter() - started
     undecided = isinstance(first, first_policy.Undecided) and not deadline()
     return job.solved(solution, outcome, verified, undecided)
 
 
 def _infeasible(
-    lp: StabilizationLP, first: first_policy.Refused, wishes: _Wishes, job: _Job, started: float
+    lp: StabilizationLP, first: first_policy.Refused, request: _Request, job: _Job, started: float
 ) -> Result | None:
     """Return the refusal of gamma, or the answer on the other cells; None if it is not proved."""
-    verified = _refuse(lp, first, wishes.tolerance)
+    verified = _refuse(lp, first, request.tolerance)
     w = verified.witness.refusal
     if not verified.certificate.refusal or w is None:
         return None
-    smaller = restriction.restricted(lp, w) if wishes.restrict_to_gamma else None
+    smaller = restriction.restricted(lp, w) if request.restrict_to_gamma else None
     if smaller is not None:
-        return job.restricted(_answer(smaller, wishes), lp.expand(w, 0.0, 0.0))
-    job.solve_seconds, job.finish = time.perf_counter() - started, wishes.deadline.again()
-    limits = gamma_bar.bracket(lp, wishes.deadline, start=first.best)
+        return job.restricted(_answer(smaller, request), lp.expand(w, 0.0, 0.0))
+    job.solve_seconds, job.finish = time.perf_counter() - started, request.deadline.again()
+    limits = gamma_bar.bracket(lp, request.deadline, start=first.best)
     bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
     message = restriction.refusal_message(lp, w, limits, bracket)
     return job.refused(Cause.GAMMA, message, verified, bracket)
@@ -169,28 +169,28 @@ def _infeasible(
 def _asked(
     lp: StabilizationLP,
     first: first_policy.Feasible | first_policy.Undecided,
-    wishes: _Wishes,
+    request: _Request,
     job: _Job,
 ) -> tuple[Solution, _Outcome]:
     """Return what the backend says, and its policy polished; it is not asked where undecided."""
-    deadline, iteration = wishes.deadline, None
+    deadline, iteration = request.deadline, None
     if isinstance(first, first_policy.Undecided):
         word = "time limit" if deadline() else "undecided"
         stop = Stop.TIME_LIMIT if deadline() else Stop.FAILED
         solution = Solution(stop, word, policy=first.policy)
     else:
         options = Options(
-            tolerance=wishes.tolerance,
+            tolerance=request.tolerance,
             time_limit=deadline.left,
-            max_iterations=wishes.max_iterations,
-            algorithm=wishes.algorithm,
+            max_iterations=request.max_iterations,
+            algorithm=request.algorithm,
             start=first.policy,
             proof=first.w,
-            progress=wishes.progress,
+            progress=request.progress,
         )
-        wishes.tell("solve")
-        solution, iteration, job.log = ask(lp, wishes.backend, options)
-    outcome = _polish(lp, solution, iteration, first.policy, wishes.tolerance, deadline)
+        request.tell("solve")
+        solution, iteration, job.log = ask(lp, request.backend, options)
+    outcome = _polish(lp, solution, iteration, first.policy, request.tolerance, deadline)
     return solution, outcome
 
 

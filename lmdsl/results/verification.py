@@ -128,11 +128,11 @@ def verify(
     exactly = partial(exact_verdict, guard=in_time)
     judge = exactly if inputs.flag(exact, "exact") else verdict
     path = inputs.path(path)
-    held = archive.read(path)
-    result, reasons = held.result, list[str]()
+    stored = archive.read(path)
+    result, reasons = stored.result, list[str]()
     notes = [
         f"{name} was written anew since the save; what it holds now was judged"
-        for name in held.rewritten
+        for name in stored.rewritten
     ]
     lp = whole = recompiled(path, result, progress, deadline)
     in_time()
@@ -156,9 +156,9 @@ def verify(
         certificate = _judge_claims(lp, result, reasons, judge)
         if result.status != Status.VERIFIED:
             reasons.append(f"the status is {result.status}, not verified")
-    reasons += differences(whole, lp, result, held.certificate, certificate)
+    reasons += differences(whole, lp, result, stored.certificate, certificate)
     in_time()
-    reasons += local_differences(lp, result, held.certificate, deadline)
+    reasons += local_differences(lp, result, stored.certificate, deadline)
     return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
 
 

@@ -156,7 +156,7 @@ class OdeSystem(System):
 
 
 MOST_WRITTEN = 1_000
-"""Operations, and nodes of the formulas times substeps, up to which a step is written out."""
+"""Number of operations, or of subformulas times substeps, above which a step is not written out."""
 
 
 class _RungeKutta:

@@ -15,7 +15,7 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.testing import known
 from lmdsl.testing.probe import Broken, Probe, Unjudged, judge, misshapen
 
-TIGHT = 1e-7
+TIGHT = 1e-7  # relative error above which an answer asked for with this tolerance is wrong
 
 
 UNKNOWN = "no such algorithm"

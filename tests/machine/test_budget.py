@@ -48,7 +48,7 @@ HUGE = {
 @pytest.mark.parametrize("name", HUGE)
 @pytest.mark.parametrize("call", [lm.compile, lm.solve, lm.compare, lm.gamma_max, lm.explain])
 def test_what_is_too_large_is_refused_before_anything_is_made(name, call, monkeypatch):
-    monkeypatch.setattr(memory, "available", lambda: memory.Room(10**9, "a test"))
+    monkeypatch.setattr(memory, "available", lambda: memory.Memory(10**9, "a test"))
     problem = made(HUGE[name])
     lm.solve(made(steps()))
     tracemalloc.start()
@@ -64,7 +64,7 @@ def test_what_is_too_large_is_refused_before_anything_is_made(name, call, monkey
     "make", [discretization.offsets, discretization.control_vectors, discretization.noise_nodes]
 )
 def test_grids_ask_by_themselves(make, monkeypatch):
-    monkeypatch.setattr(memory, "available", lambda: memory.Room(10**7, "a test"))
+    monkeypatch.setattr(memory, "available", lambda: memory.Memory(10**7, "a test"))
     name = {discretization.offsets: "points", discretization.noise_nodes: "noise"}.get(
         make, "controls"
     )
@@ -81,7 +81,7 @@ def test_so_are_directories(command, tmp_path, monkeypatch, capsys):
     data = json.loads((out / "problem.json").read_text())
     data["control_grid"] = HUGE["controls"]["control_grid"]
     (out / "problem.json").write_text(json.dumps(data))
-    monkeypatch.setattr(memory, "available", lambda: memory.Room(10**8, "a test"))
+    monkeypatch.setattr(memory, "available", lambda: memory.Memory(10**8, "a test"))
     more = ["--format", "drn", "--out", str(tmp_path / "x")] if command == "export" else []
     assert main([command, str(out), *more]) == 2
     assert "(a test)" in capsys.readouterr().err

@@ -92,7 +92,7 @@ def test_many_samples_are_sorted_to_the_same_rows(monkeypatch):
         with monkeypatch.context() as patch:
             patch.setattr("lmdsl.model.assembly.sampler.CHUNK", 1)
             assert lm.compile(made(data)).digest == usual
-            patch.setattr("lmdsl.model.assembly.transitions.MANY", 1)
+            patch.setattr("lmdsl.model.assembly.transitions.SORTED_ALONE", 1)
             assert lm.compile(made(data)).digest == usual
 
 

@@ -154,8 +154,8 @@ def test_where_nothing_is_known_something_is_assumed(tmp_path):
 
 
 def test_a_refusal_says_what_limits(monkeypatch):
-    room = memory.Room(3 * 10**9, "control group /job")
-    monkeypatch.setattr(memory, "available", lambda: room)
+    free = memory.Memory(3 * 10**9, "control group /job")
+    monkeypatch.setattr(memory, "available", lambda: free)
     memory.require(3 * 10**9, "it fits")
     with pytest.raises(
         BadInput, match=r"about 4 GB .*\(rows\).* 3 GB .*\(control group /job\); use"

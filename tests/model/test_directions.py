@@ -123,7 +123,7 @@ def test_up_and_down_alone_takes_more():
 
 
 def test_two_halves_are_swept_in_the_same_directions(monkeypatch):
-    monkeypatch.setattr(gauss_seidel, "SPLIT", 10)
+    monkeypatch.setattr(gauss_seidel, "PARALLEL_FROM", 10)
     for signs in product((1, -1), repeat=2):
         M = drift((12, 17), signs)
         system = replace(

@@ -1,4 +1,4 @@
-"""x = b + M x: classes, what is paid, sweeps in halves and sweeps that diverge, by definition."""
+"""x = b + M x: classes, where x > 0, sweeps in halves and sweeps that diverge, by definition."""
 
 from __future__ import annotations
 
@@ -51,17 +51,17 @@ def test_a_cell_that_keeps_all_of_itself_costs_nothing_or_has_no_solution(own):
     np.testing.assert_array_equal(x, [0.0, 1.0])
 
 
-def test_where_something_is_paid():
+def test_where_the_solution_is_positive():
     rng = np.random.default_rng(2)
     for _ in range(30):
         M, b = sparse(60, rng, 0.02), np.where(rng.random(60) < 0.05, 1.0, 0.0)
         reach = np.linalg.matrix_power((M.toarray() > 0) + np.eye(60), 60) > 0
-        np.testing.assert_array_equal(equations._pays(SplitMatrix.of(M), b), reach @ (b > 0))
+        np.testing.assert_array_equal(equations._positive(SplitMatrix.of(M), b), reach @ (b > 0))
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
 def test_each_half_sees_the_other_as_it_was_before_the_sweep(count, monkeypatch):
-    monkeypatch.setattr(gauss_seidel, "SPLIT", 1)
+    monkeypatch.setattr(gauss_seidel, "PARALLEL_FROM", 1)
     rng = np.random.default_rng(count)
     for n in (2, 7, 50):
         M, b, x = sparse(n, rng, 0.5).toarray(), rng.random(n), rng.random(n)
@@ -82,7 +82,7 @@ def test_each_half_sees_the_other_as_it_was_before_the_sweep(count, monkeypatch)
 
 @pytest.mark.parametrize("split", [1, 10**9])
 def test_sweeps_that_diverge_say_so(split, monkeypatch):
-    monkeypatch.setattr(gauss_seidel, "SPLIT", split)
+    monkeypatch.setattr(gauss_seidel, "PARALLEL_FROM", split)
     M = sp.csr_array(np.array([[0.0, 3.0], [3.0, 0.0]]))
     x = np.ones(2)
     assert SplitMatrix.of(M).sweep(np.ones(2), x, 2_000)[1] == np.inf

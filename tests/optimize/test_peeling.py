@@ -128,7 +128,7 @@ def test_a_walk_in_from_both_ends_is_peeled_pair_by_pair():
 def test_large_levels_in_several_threads(monkeypatch, many, workers):
     M = matrix(3, 300, 5)
     peeled, b = Peeled.of(SplitMatrix.of(M)), np.random.default_rng(0).random(300)
-    monkeypatch.setattr(substitution, "MANY", many)
+    monkeypatch.setattr(substitution, "PARALLEL_FROM", many)
     monkeypatch.setattr(threads, "count", lambda: workers)
     x = np.linalg.solve(np.eye(300) - M.toarray(), b)
     y = np.where(np.isin(np.arange(300), peeled.core), x, np.nan)
@@ -214,7 +214,7 @@ def test_slots_hold_the_rows_of_the_last_policy(monkeypatch, seed):
     rng = np.random.default_rng(seed)
     lp = random_lp(rng, 20, 5, gamma=0.9)
     if seed % 2:
-        monkeypatch.setattr(rows, "MANY", 1)  # in several ranges
+        monkeypatch.setattr(rows, "PARALLEL_FROM", 1)  # in several ranges
     P, slots = dense(lp), Slots.of(lp.rows, lp.pair_pointer, lp.gamma, lp._directions)
     pair = lp.pair_pointer[:-1].copy()
     for _ in range(6):

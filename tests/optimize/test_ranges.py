@@ -24,10 +24,10 @@ from lmdsl.optimize.policies import bellman
 def test_ranges_and_halves_give_the_same_policy(monkeypatch, workers):
     problem = made(standard_map(16))
     whole = lm.solve(problem)
-    monkeypatch.setattr(vectors, "GRAIN", 1)
-    monkeypatch.setattr(gauss_seidel, "SPLIT", 1)
-    for room in (rows, substitution, judge, witness):
-        monkeypatch.setattr(room, "MANY", 1)
+    monkeypatch.setattr(vectors, "TRANSITIONS_A_RANGE", 1)
+    monkeypatch.setattr(gauss_seidel, "PARALLEL_FROM", 1)
+    for module in (rows, substitution, judge, witness):
+        monkeypatch.setattr(module, "PARALLEL_FROM", 1)
     monkeypatch.setattr(threads, "count", lambda: workers)
     parts = lm.solve(problem)
     assert parts.status == whole.status == "verified"
@@ -41,7 +41,7 @@ def test_halves_solve_the_system(monkeypatch):
     M = sp.csr_array(rng.random((n, n)) * (rng.random((n, n)) < 0.1))
     M.data *= 0.9 / np.maximum(M.sum(axis=1), 1e-9).max()
     b = rng.random(n)
-    monkeypatch.setattr(gauss_seidel, "SPLIT", 1)
+    monkeypatch.setattr(gauss_seidel, "PARALLEL_FROM", 1)
     x = equations.solve(M, b)
     np.testing.assert_allclose(x, np.linalg.solve(np.eye(n) - M.toarray(), b), rtol=1e-12)
 
@@ -50,7 +50,7 @@ def test_a_pass_agrees_with_numpy(monkeypatch):
     lp = lm.compile(made(standard_map(16)))
     V = np.random.default_rng(1).random(lp.n)
     Q = lp.gamma * (lp.rows.matrix() @ V) + lp.cost
-    monkeypatch.setattr(vectors, "GRAIN", 1)
+    monkeypatch.setattr(vectors, "TRANSITIONS_A_RANGE", 1)
     found = bellman.improve(lp, V)
     np.testing.assert_allclose(found.value, np.minimum.reduceat(Q, lp.pair_pointer[:-1]))
     np.testing.assert_allclose(Q[found.policy], found.value)
@@ -59,7 +59,7 @@ def test_a_pass_agrees_with_numpy(monkeypatch):
 @pytest.mark.parametrize("gamma", [0.9, 1.0, 1.3])
 def test_a_rising_pass_agrees_with_numpy(gamma, monkeypatch):
     """Cells in turn, staying put summed up; who stays at no less than 1 / gamma is no choice."""
-    monkeypatch.setattr(vectors, "GRAIN", 1)
+    monkeypatch.setattr(vectors, "TRANSITIONS_A_RANGE", 1)
     rose = stuck = 0
     for seed in range(20):
         rng = np.random.default_rng(seed)

@@ -72,7 +72,7 @@ def begun(lp):
 @pytest.mark.parametrize("ranges", [1, 3])
 def test_passes_agree_with_numpy_and_bounds_hold(monkeypatch, ranges):
     monkeypatch.setattr(bellman, "IN_PLACE", ranges)
-    monkeypatch.setattr(vectors, "GRAIN", 1)
+    monkeypatch.setattr(vectors, "TRANSITIONS_A_RANGE", 1)
     left_out = 0
     for lp in models():
         if (start := begun(lp)) is None:

@@ -161,7 +161,7 @@ def test_a_million_cells_are_drawn_in_bounded_work():
 @pytest.mark.parametrize("draw", [lm.plotting.figure, lm.plotting.cost, lm.plotting.measure])
 def test_a_plot_that_does_not_fit_is_refused(monkeypatch, draw):
     result = lm.solve(made(standard_map(400, 1.0)))
-    monkeypatch.setattr(memory, "available", lambda: memory.Room(2**24, "a test"))
+    monkeypatch.setattr(memory, "available", lambda: memory.Memory(2**24, "a test"))
     with pytest.raises(lm.BadInput, match=r"plots?\) and 16\.8 MB are available \(a test\)"):
         draw(result)
 

@@ -32,7 +32,7 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     Solving is counted for the default backend, as it goes as a rule. What takes more (cells that
     are lost, ties, other backends, a first policy that is hard to find) asks when it comes to it.
     """
-    # Capped: a stranger's product of counts may exceed the range of doubles.
+    # Capped: a product of declared counts may exceed the range of doubles.
     N = min(math.prod(axis.cells for axis in problem.state_box.values()), 10**40)
     M = min(discretization.control_count(problem), 10**40)
     S = min(discretization.sample_points(problem) * discretization.node_count(problem), 10**40)
@@ -82,7 +82,7 @@ def _grids(problem: Problem, M: int, S: int) -> int:
 
 
 SHORT = 2e9
-"""Additions up to which compiling takes a moment, and is not ended for the time it takes."""
+"""Number of additions above which compiling takes more than a moment, and heeds the deadline."""
 
 
 SAMPLE = 40

@@ -20,10 +20,10 @@ from lmdsl.model.assembly.tape import Inputs, Located, Tape, run
 from lmdsl.model.grid.axis import AxisCells
 
 LINE = 512
-"""Samples at a time: a dozen lines of them fit into the first-level cache."""
+"""Number of samples at a time: a dozen lines of them fit into the first-level cache."""
 
 LEAST, MOST = 8, 1_000
-"""Instructions worth it: with fewer NumPy is as fast, with many more lines leave the cache."""
+"""Number of instructions below which NumPy is as fast, and above which lines leave the cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class Lines:
 
     @classmethod
     def of(cls, program: Program, controls: Collection[str]) -> Self | None:
-        """Split a program; None where that does not pay, or large arrays need more than arithmetic.
+        """Split a program; None where it gains nothing, or large arrays need more than arithmetic.
 
         ``controls`` are the names of the values that vary along one axis, all others along the
         rest.

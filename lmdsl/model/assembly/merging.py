@@ -69,12 +69,12 @@ def merge(index, cells_last, mean, numbers, key, high, wide, rows):  # type: ign
     numbers
         :class:`Numbering`.
     key
-        Room for ``target << bits | group`` of the samples of a tile, an integer type wide enough
+        Space for ``target << bits | group`` of the samples of a tile, an integer type wide enough
         for it, shape (S, high * wide).
     high, wide
         Cells and controls of a tile: :func:`tile`.
     rows
-        The result, :class:`BlockRows` with room enough, ``per_cell`` zeros on entry.
+        The result, :class:`BlockRows` with space enough, ``per_cell`` zeros on entry.
 
     Returns
     -------
@@ -243,7 +243,7 @@ def mean_cost(cost, points, weights, mean, least):  # type: ignore[no-untyped-de
         Shape (first, last), zeros on entry; the sum of weight times cost, in the order of the
         samples, over the total weight.
     least
-        Room in the shape of ``mean``, zeros on entry.
+        Space in the shape of ``mean``, zeros on entry.
     """
     total = 0.0
     for weight in weights:

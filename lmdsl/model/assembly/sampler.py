@@ -26,13 +26,13 @@ from lmdsl.systems.base import StateMap
 from lmdsl.systems.function import Audit, FunctionMap
 
 CHUNK = 2**17
-"""Samples evaluated at a time: few enough to stay in cache, many enough to keep threads apart."""
+"""Number of samples at a time: few enough to stay in cache, many enough to keep threads apart."""
 
 LEAST_LINE = 64
-"""Pairs side by side below which arithmetic line by line does not pay: its lines are as short."""
+"""Number of pairs side by side from which on arithmetic goes line by line."""
 
 FEW = 16
-"""Cells and controls of which a function is asked twice."""
+"""Number of cells, and of controls, above which a function is asked twice of so many only."""
 
 
 class Block(NamedTuple):
@@ -154,8 +154,8 @@ class Sampler:
         if last >= LEAST_LINE:
             images, costs = self._images, self._costs
             if images is not None:
-                paid = weights if costs is images else None
-                index, mean = images(values, shape, axes, clip, paid)
+                weighting = weights if costs is images else None
+                index, mean = images(values, shape, axes, clip, weighting)
             if costs is not None and costs is not images:
                 _, mean = costs(values, shape, (), clip, weights)
         index = self.images(block, values) if index is None else index

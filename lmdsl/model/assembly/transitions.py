@@ -40,8 +40,8 @@ class Transitions:
     cost: Floats  # weighted mean of the stage cost over the samples of each pair
 
 
-MANY = CHUNK // 2
-"""Samples from which those of a pair are sorted by themselves."""
+SORTED_ALONE = CHUNK // 2
+"""Number of samples of a pair from which on they are sorted by themselves."""
 
 
 def assemble(
@@ -80,10 +80,11 @@ def _assembled(
     F, M = len(sets.free), len(sampler.controls)
     shares = Shares.of(len(sampler.points), sampler.nodes)
     pairs = int(F * M * min(1.0, 1.05 * pilot.admissible)) + M
-    room = int(pairs * 1.05 * pilot.entries) + sampler.samples
+    capacity = int(pairs * 1.05 * pilot.entries) + sampler.samples
     pointer, control = _Growing(np.int64, pairs + 1), _Growing(np.int32, pairs)
     cost = _Growing(np.float64, pairs)
-    target, code = _Growing(np.int32, room), _Growing(code_type(len(shares.numerator)), room)
+    target = _Growing(np.int32, capacity)
+    code = _Growing(code_type(len(shares.numerator)), capacity)
     pair_pointer = np.zeros(F + 1, dtype=np.int64)
     pointer.append(np.zeros(1, dtype=np.int64))
     done = 0
@@ -146,7 +147,7 @@ class _Assembler:
         per_cell, control, cost, end, target, code = rows
         high, wide = tile(block.cells_last, block.width)
         high = min(high, len(block.cells))
-        if lanes == 1 and sampler.samples >= MANY:
+        if lanes == 1 and sampler.samples >= SORTED_ALONE:
             sampler.guard()
             row = merge_one(index, self.numbers)
             entries = len(row[0])
@@ -218,11 +219,11 @@ def _refuse_cost(sampler: Sampler, cell: int, control: int) -> None:
 class _Growing:
     """An array that grows by reallocation, so that no second copy of it ever exists.
 
-    Room that is never used is never touched: it takes addresses, not memory.
+    Capacity that is never used is never touched: it takes addresses, not memory.
     """
 
-    def __init__(self, dtype: Any, room: int) -> None:
-        self.data = np.empty(room, dtype=dtype)
+    def __init__(self, dtype: Any, capacity: int) -> None:
+        self.data = np.empty(capacity, dtype=dtype)
         self.used = 0
 
     def append(self, part: NDArray[Any]) -> None:

@@ -18,9 +18,9 @@ EDGE = 1e-9
 """Width of an edge in cells: points this close to an edge count as lying on it."""
 
 MOST_TURNS = 2.0**20
-"""Turns away from a circle beyond which an image counts as out: its place is rounding error."""
+"""Number of turns away from a circle above which an image counts as out: rounding decides it."""
 
-ROUNDING = 2.0**-53
+ROUNDING = 2.0**-53  # relative error of a rounded operation
 
 
 class AxisCells(NamedTuple):

@@ -1,6 +1,6 @@
 """A set of cells as a few boxes: disjoint, axis-aligned, largest first, as far as a count allows.
 
-A box is grown from the cell that has the most room around it: face by face, one layer of cells at
+A box is grown from the cell that is farthest inside the set: face by face, one layer of cells at
 a time, until no face can move. Its cells are then taken out and the next box is grown in what is
 left, so every box holds cells of the set only and no cell is counted twice. A pass costs one visit
 per cell and axis. On a periodic axis boxes grow across the seam.
@@ -48,7 +48,7 @@ class Region(Frozen):
 
 
 MOST_REGIONS = 8
-"""Boxes by which a set of cells is named."""
+"""Number of boxes above which a set of cells is named in part."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +113,9 @@ def regions(partition: Partition, mask: Bools, limit: int) -> tuple[Region, ...]
     stride[:-1] = np.cumprod(shape[:0:-1])[::-1]
     found: list[Region] = []
     while len(found) < limit and left.any():
-        room = np.ones(len(left))
-        _room(left, room, shape, stride, partition.periodic)
-        seed = int(np.argmax(room))
+        clearance = np.ones(len(left))
+        _widest(left, clearance, shape, stride, partition.periodic)
+        seed = int(np.argmax(clearance))
         first = seed // stride % shape
         count = np.ones(d, dtype=np.int64)
         _grow(left, shape, stride, partition.periodic, first, count)
@@ -151,8 +151,8 @@ def _region(partition: Partition, first: Indices, count: Indices, stride: Indice
 
 
 @kernel(allocates=True)
-def _room(left, room, shape, stride, periodic):  # type: ignore[no-untyped-def]
-    """Multiply room by the width, on every axis, of the widest symmetric run around a cell."""
+def _widest(left, out, shape, stride, periodic):  # type: ignore[no-untyped-def]
+    """Multiply ``out`` by the width, on every axis, of the widest symmetric run around a cell."""
     N = len(left)
     for k in range(len(shape)):
         n, s = shape[k], stride[k]
@@ -170,7 +170,7 @@ def _room(left, room, shape, stride, periodic):  # type: ignore[no-untyped-def]
                     run = min(run + 1, n) if left[start + i * s] else 0
                     if turn == (1 if periodic[k] else 0):
                         width = 2 * min(run, behind[i]) - 1
-                        room[start + i * s] *= max(min(width, n), 0)
+                        out[start + i * s] *= max(min(width, n), 0)
 
 
 @kernel(allocates=True)

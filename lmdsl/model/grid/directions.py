@@ -1,7 +1,7 @@
 """Orders in which sweeps visit the cells: along every axis of the box, in both directions.
 
 A Gauss-Seidel sweep carries values all the way in the direction in which it visits the cells, and a
-cell or two in others. What it costs to get home, in a controlled system, goes against its flow,
+cell or two in others. What it costs to get to A, in a controlled system, goes against its flow,
 which turns: a pendulum swings through all four quadrants of its plane. Sweeps in every combination
 of directions, one after the other, follow it ("fast sweeping", Zhao, Math. Comp. 74, 2005).
 From one sweep to the next a single axis turns, the first axis first.
@@ -19,13 +19,13 @@ from lmdsl.common.types import Indices
 from lmdsl.machine.forking import cached_property
 
 MOST_FLIPPED = 2
-"""Axes besides the first that are visited in both directions: the last ones of many.
+"""Number of axes besides the first above which only the last ones are visited in both directions.
 
 More directions take more memory, and each sweep longer: cells are read less in a row.
 """
 
 FEW = 4
-"""Of so many cells one: these are sorted anew, more are picked from the orders of all."""
+"""Share of the cells, one in so many, above which they are picked from the orders of all cells."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,7 +22,7 @@ from lmdsl.machine.forking import cached_property
 from lmdsl.model.grid.axis import EDGE, AxisCells
 from lmdsl.problem.problem import Problem
 
-MAX_CELLS = 2**31 - 2
+MAX_CELLS = 2**31 - 2  # number of cells above which indices of 32 bits do not suffice
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,8 +25,8 @@ from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
 from lmdsl.problem.problem import Problem
 
-MAX_RICCATI = 256  # states of the Riccati equation: orbit points times axes
-PART = 2**12  # states compared with all points of an orbit at a time
+MAX_RICCATI = 256  # number of its states (orbit points x axes) above which no LQR is computed
+PART = 2**12  # number of states compared with all points of an orbit at a time
 
 
 def _on_arrays(operation: str, *operands: Any) -> Any:

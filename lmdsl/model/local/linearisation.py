@@ -13,7 +13,7 @@ from lmdsl.model.discretization import noise_nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.true_map import TrueMap
 
-ON_ORBIT = 1e-3  # cell widths by which a point may miss its successor
+ON_ORBIT = 1e-3  # cell widths above which a point that misses its successor is on no orbit
 
 
 def points(orbit: Sequence[Any], partition: Partition) -> Floats:

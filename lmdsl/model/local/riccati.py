@@ -12,13 +12,13 @@ import numpy as np
 
 from lmdsl.common.types import Floats
 
-STEPS, DOUBLINGS = 200, 64
+STEPS, DOUBLINGS = 200, 64  # number of Newton steps, and of doublings, above which it fails
 ENOUGH, ROUNDING, FALLING = 1e-13, 1e-6, 0.9
 """Relative change of the gain that ends the work, and below which it only has to stop falling: near
 a mode that hardly decays Newton halves it."""
-RESIDUAL = 1e-8
+RESIDUAL = 1e-8  # residual relative to the solution above which it is refused
 STABLE = 1 - 1e-11
-"""Largest modulus of a mode under feedback that rounding in 1 - K leaves digits of."""
+"""Modulus of a mode under feedback above which rounding in 1 - K leaves no digits of it."""
 LEAST = -1000.0
 """Least power of two that a weight may have beside the largest: smaller ones are as good as it."""
 

@@ -19,10 +19,11 @@ from lmdsl.optimize.policies.evaluation import peeled, stability_vector
 from lmdsl.optimize.policies.iteration import iterate
 
 SWEEPS, MOST_ROUNDS = 30, 8
-"""Sweeps after which a proof is given up unless they moved it much less than the ones before."""
+"""Number of sweeps after which a proof is given up unless they moved it much less than the ones
+before, and of rounds of them."""
 
 NEAR = 64
-"""Largest level up to which a few passes from the levels may make a stabilizing policy."""
+"""Largest level above which a few passes from the levels hardly make a stabilizing policy."""
 
 
 @dataclass(frozen=True, eq=False)

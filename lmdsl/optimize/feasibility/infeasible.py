@@ -17,8 +17,8 @@ from lmdsl.optimize.policies import evaluation, iteration
 WIDTH, LEAST_WIDTH = 1e-6, 1e-8
 """Relative width of the bracket aimed at, and the least that may be asked for."""
 
-DODGES = 12
-"""Steps of optimal stopping towards the cells that limit gamma_bar, which only names them."""
+MOST_STEPS_INSIDE = 12
+"""Number of steps of optimal stopping above which the cells that limit gamma_bar stay unnamed."""
 
 
 def check_high(lp: StabilizationLP, w: Floats) -> float | None:
@@ -72,7 +72,7 @@ def _beyond(
     reward = np.where(going, 1.0, start.x)  # which nothing changes, where no policy is better
     if inside is not None:
         reward, going = np.where(inside, reward, 0.0), going & inside
-    limit = 1000 if inside is None else DODGES
+    limit = 1000 if inside is None else MOST_STEPS_INSIDE
     found = stopping.optimal_stopping(lp, gamma, reward, start.policy, going, time_up, limit)
     if found is None:
         return None
@@ -99,12 +99,12 @@ def _core(
 
     Their Perron vectors serve where the best policy is also the least favourable one for them. Else
     stopping is rewarded in these classes only. Where neither closes the bracket (the controls can
-    dodge from one slow class to another), w_high itself serves.
+    go round one slow class through another), w_high itself serves.
     """
     needed = check_high(lp, best.slow_vector)
     if needed is not None and needed <= most:
         return best.slow_vector, max(high, needed)
-    # How far the controls can dodge these classes: they limit nothing if far enough.
+    # How far the controls can go round these classes: they limit nothing if far enough.
     alone = spectral_radius.improved(lp, best, time_up, most, inside=best.slowest)
     if alone.limit > most:
         return w_high, high

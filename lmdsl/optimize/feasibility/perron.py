@@ -18,7 +18,7 @@ SLOWER = 1e-3
 """How much slower than the slowest class one is known to be before its exact rate is left open."""
 
 STEPS, FINE = 100, 1e-11
-"""Steps of Noda's iteration, at most, and the relative width at which it ends."""
+"""Number of steps of Noda's iteration above which it fails, and relative width that ends it."""
 
 REACH = 1e-4
 """First relative step down to a rate that may be too low; then four times as far each time."""

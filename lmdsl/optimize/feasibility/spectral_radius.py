@@ -28,16 +28,16 @@ from lmdsl.optimize.linear import classes, equations
 from lmdsl.optimize.policies import bellman, iteration
 
 TIED = 1e-6
-"""Relative difference up to which two classes count as equally slow."""
+"""Relative difference of rates above which two classes do not count as equally slow."""
 
 PASSES = 8
 """Passes over all pairs towards a policy from which runs last least."""
 
 HORIZON = 4
-"""A policy should bring runs home within so many times the steps that it takes with luck."""
+"""Number of times the least possible steps within which a policy should bring runs to A."""
 
 ROUNDS, COARSE, SLIGHT = 100, 1e-2, 1e-10
-"""Improvements of a policy at most; how well its first rates are known; a relative gain of none."""
+"""Number of improvements above which none is made; how well first rates are known; gain of none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,7 @@ def of_policy(
 
 
 def short_lived(lp: StabilizationLP, time_up: TimeUp = never) -> PolicyClasses:
-    """Return a policy that brings runs home within a few steps, as far as any is known to do.
+    """Return a policy that brings runs to A within a few steps, as far as any is known to do.
 
     From the levels of Algorithm 1, w <- min_a P_a w weighs what has not arrived by then. Where runs
     last under the policy that comes out, as on long ways, the optimum under unit cost, discounted,

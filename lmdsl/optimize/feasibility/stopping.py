@@ -104,7 +104,7 @@ def _stopped(
     before: Floats,
     time_up: TimeUp,
 ) -> Floats | None:
-    """Return what a stopping policy is paid: w = gamma P w where it goes, the reward elsewhere.
+    """Return the reward of a stopping policy: w = gamma P w where it goes, the reward elsewhere.
 
     It is solved in units of ``before``, as w may fall over many decades.
     """

@@ -12,9 +12,8 @@ from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.kernels import kernel
 from lmdsl.optimize.linear.gauss_seidel import CEILING
 
-MAX_FACTORED = 100_000
-
-DENSE = 50
+MAX_FACTORED = 100_000  # number of cells above which a class is not factored
+DENSE = 50  # number of cells above which a class is factored as a sparse matrix
 
 _filtering = threading.Lock()
 """Filters of warnings belong to the process: one thread at a time changes and restores them."""
@@ -64,7 +63,7 @@ def _solve_class(M: Any, b: Floats, x: Floats, cells: Indices) -> bool:
     known = b[cells] + rows @ x
     scale = float(known.max())
     if scale == 0.0:
-        return True  # nothing is paid here or after: 0, whatever the class does
+        return True  # no cost is incurred here or after: 0, whatever the class does
     if not np.isfinite(scale):
         return False
     inner = rows[:, cells]

@@ -24,14 +24,15 @@ from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, TOLERANCE, SplitM
 from lmdsl.optimize.linear.krylov import _bicgstab
 from lmdsl.optimize.linear.substitution import Peeled
 
-TRIAL_SWEEPS = 60
-MAX_SWEEPS = 200_000
+TRIAL_SWEEPS = 60  # number of sweeps after which it is asked how fast they converge
+MAX_SWEEPS = 200_000  # number of sweeps above which they are given up
 KRYLOV, KRYLOV_STEPS, KRYLOV_SWEEPS = 1000, 200, 1600
-"""Least size of a system, most steps, and most sweeps in them, two cycles each."""
+"""Number of components from which on Krylov steps are made; of steps, and of sweeps in them, two
+cycles each, above which they end."""
 FEW_SWEEPS, MANY_SWEEPS = 100, 300
-"""Sweeps that are made rather than Krylov's steps, and rather than a sparse factorisation."""
+"""Number of sweeps to go above which Krylov steps, and a sparse factorisation, are tried first."""
 PER_CORE = 20
-"""The core may be swept more often than all cells, up to so many times."""
+"""Number of sweeps of the core for one of all cells above which all are swept again."""
 
 
 def solve(
@@ -173,9 +174,9 @@ def _solve(
     time_up: TimeUp,
 ) -> Floats | None:
     """Solve from a guess, which is overwritten, by sweeps or class by class."""
-    nothing = ~_pays(system, b) if (b == 0).any() else None
+    nothing = ~_positive(system, b) if (b == 0).any() else None
     if nothing is not None:
-        x[nothing] = 0.0  # exactly: a guess would only fade there
+        x[nothing] = 0.0  # exactly: a guess would only decay there
     change, rate = _trial(system, b, x, enough, flat)
     if change <= enough:
         return x
@@ -244,11 +245,11 @@ def _krylov(
     return guess
 
 
-def _pays(system: SplitMatrix, b: Floats) -> Bools:
+def _positive(system: SplitMatrix, b: Floats) -> Bools:
     """Return where x > 0: the cells from which some b > 0 can be reached."""
-    pays, before = b > 0, system.transposed()
-    _spread(before.begin, before.end, before.indices, pays)
-    return pays
+    positive, before = b > 0, system.transposed()
+    _spread(before.begin, before.end, before.indices, positive)
+    return positive
 
 
 def _soon(change: float, rate: float, sweeps: int) -> bool:

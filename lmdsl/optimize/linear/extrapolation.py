@@ -1,4 +1,4 @@
-"""Jumps along the one mode in which sweeps stall, such as the slow escape from a well-mixed set.
+"""Extrapolation along the one mode in which sweeps stall: the slow escape from a well-mixed set.
 
 Both take a few Jacobi steps, after which the residual is nearly that mode, and go as far along it
 as every component allows: down to just above the solution of x = b + M x, or up to above it.
@@ -9,10 +9,10 @@ import numpy as np
 from lmdsl.common.types import Floats
 from lmdsl.optimize.linear.gauss_seidel import CEILING, SplitMatrix
 
-SWEEPS, STEPS = 4, 16
+SWEEPS, STEPS = 4, 16  # number of sweeps, and of Jacobi steps, before extrapolating
 LEAST_FALL, FARTHEST = 1e-10, 1e4
-"""A leap is not taken for a smaller relative fall, nor farther: rounding would decide its end."""
-ROUNDING = 1e-13
+"""Relative fall below which, and number of Jacobi steps above which, rounding would decide."""
+ROUNDING = 1e-13  # relative rise up to which x counts as above b + M x
 
 
 def extrapolate(system: SplitMatrix, b: Floats, x: Floats) -> float:

@@ -14,10 +14,10 @@ from lmdsl.machine import threads
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.grid.directions import Directions
 
-TOLERANCE = 2e-15
-CEILING = 1e305
-NEVER = 1e308
-SPLIT = 100_000
+TOLERANCE = 2e-15  # relative change up to which a sweep counts as none
+CEILING = 1e305  # value above which a component counts as infinite
+NEVER = 1e308  # in place of 1 / (1 - M_ii) where M_ii >= 1
+PARALLEL_FROM = 100_000  # number of components from which on two threads sweep
 
 
 class SplitArrays(NamedTuple):
@@ -83,7 +83,7 @@ class SplitMatrix:
         self, b: Floats, x: Floats, count: int, enough: float = TOLERANCE, flat: float = 0.0
     ) -> tuple[float, float]:
         """Make Gauss-Seidel sweeps for x = b + M x in place; see :func:`_gauss_seidel`."""
-        if len(x) >= SPLIT:  # by size alone: the result does not depend on the threads
+        if len(x) >= PARALLEL_FROM:  # by size alone: the result does not depend on the threads
             return _in_halves(self, b, x, count, enough, flat)
         orders, cycle = self.directions.orders, self.directions.cycle
         halfway, last = _gauss_seidel(self.kernel, orders, cycle, b, x, count, enough, flat)

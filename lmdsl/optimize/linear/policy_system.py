@@ -24,7 +24,7 @@ class SlotArrays(NamedTuple):
 
 
 class Slots:
-    """Room for the system of a policy: as the policy changes, only the rows that differ are copied.
+    """Arrays for the system of a policy: as it changes, only the rows that differ are copied.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class Slots:
 
     @classmethod
     def of(cls, rows: Rows, pair_pointer: Indices, gamma: float, directions: Directions) -> Self:
-        """Make room for any policy, a pair of each cell's own."""
+        """Allocate for any policy, a pair of each cell's own."""
         capacity = np.empty(len(pair_pointer) - 1, dtype=np.int64)
         pairs = pair_pointer.view(np.uint64)
         over_rows(len(capacity), _longest, pairs, rows.kernel.pointer, capacity)

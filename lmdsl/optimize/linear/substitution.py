@@ -24,13 +24,13 @@ from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, SplitMatrix
 
 CellNumbers = NDArray[np.uint32]
 
-MANY, PARTS = 40_000, 8
-"""Cells of a level that are worth several threads, and into how many ranges they are split."""
+PARALLEL_FROM, PARTS = 40_000, 8
+"""Number of cells of a level from which on it is solved in threads, and number of its ranges."""
 
 WORD, BYTE = np.uint64(64), np.uint64(8)
 
 FAR = np.uint64(8)
-"""Words between the first and last cell of a level, for each cell: with more it is not sorted."""
+"""Number of words that a level spans, for each of its cells, above which it is not sorted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +96,7 @@ class Peeled:
         """Large levels, and what lies between them, as ranges of ``order``."""
         starts = np.concatenate([[0], self.levels[:-1]]).astype(np.int64)
         spans, at = [], 0
-        for k in np.flatnonzero(self.levels - starts[: len(self.levels)] >= MANY):
+        for k in np.flatnonzero(self.levels - starts[: len(self.levels)] >= PARALLEL_FROM):
             first, last = int(starts[k]), int(self.levels[k])
             if first > at:
                 spans.append((at, first, False))

@@ -13,7 +13,7 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.vectors import over_cells, padded
 
 IN_PLACE = 4
-"""Ranges of a pass in which a cell sees the new values of its own range only: few, to see much."""
+"""Number of ranges of a pass in which a cell sees the new values of its own range only."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,18 +25,18 @@ from lmdsl.optimize.policies.evaluation import evaluate, peeled, stability_vecto
 from lmdsl.optimize.policies.screening import Pass, Screen
 
 TIE = 1e-12
-"""Relative difference in Q up to which two controls count as tied."""
+"""Relative difference in Q above which two controls are not tied."""
 
-LEAST_SWEEPS, MOST_SWEEPS = 12, 60
+LEAST_SWEEPS, MOST_SWEEPS = 12, 60  # least and largest number of sweeps of an evaluation
 
 FEW = 500
-"""Changes in fewer than one of so many cells: another pass costs less than evaluating them."""
+"""Number of cells for each changed one above which another pass costs less than an evaluation."""
 
 PATIENCE = 200
-"""Sweeps in evaluations that did not come to their end before a Krylov method takes their place."""
+"""Number of sweeps in unfinished evaluations above which a Krylov method takes their place."""
 
 PROBES = 64
-"""Rows looked at before all are."""
+"""Number of rows looked at before all are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,18 +76,18 @@ def iterate(
     Notes
     -----
     Each step changes every control for which another one is better by a relative 1e-12. Then the
-    new policy u is evaluated: to the end where few cells lie on cycles, else by sweeps
-    V <- T_u V, about as long as the improvement took, or by a leap along the one mode in which they
-    stall (:func:`~extrapolation.extrapolate`); not at all after the first step, and every
-    second time where few controls changed. V >= T_u V stays true whatever the number of sweeps, so
-    V falls and every policy on the way is gamma-stabilizing (docs/mathematics.md, Policy
-    iteration); only a policy evaluated to the end is returned as the last.
+    new policy u is evaluated: to the end where few cells lie on cycles, else by sweeps V <- T_u V,
+    about as long as the improvement took, or by an extrapolation along the one mode in which they
+    stall (:func:`~extrapolation.extrapolate`); not at all after the first step, and every second
+    time where few controls changed. V >= T_u V stays true whatever the number of sweeps, so V falls
+    and every policy on the way is gamma-stabilizing (docs/mathematics.md, Policy iteration); only a
+    policy evaluated to the end is returned as the last.
     """
     screen = Screen(lp, gamma, cost)
     sweeps = _Sweeps(screen, time_up)
     rows: Peeled | None = None  # those of the policy at hand
     V, last, step = value, None, 0  # last: the policy evaluated to the end, and its value
-    hasty = False  # the policy at hand was not evaluated at all
+    unevaluated = False  # the policy at hand was not evaluated at all
 
     def ended(converged: bool) -> Iteration:
         return Iteration(*(last or (policy, V)), step, converged, screen)
@@ -99,8 +99,8 @@ def iterate(
         if done.changed:
             step += 1
             x = done.value
-            hasty = not hasty and (step == 1 or done.changed * FEW < lp.n)
-            rows = None if hasty else Peeled.of(screen.slots.current)  # the pass copied them
+            unevaluated = not unevaluated and (step == 1 or done.changed * FEW < lp.n)
+            rows = None if unevaluated else Peeled.of(screen.slots.current)  # the pass copied them
             if rows:
                 x, exact = sweeps.lower(rows, V, done)
             screen.follow(V, x)
@@ -173,7 +173,7 @@ def bound(lp: StabilizationLP, policy: Pairs, w: Floats | None = None) -> Floats
     """Return V >= T_u V of a g-stabilizing policy, close to its value; None where none is found.
 
     With w >= g P_u w + d, c w serves as soon as c d >= G_u; sweeps then lower it. Where all rows
-    lose about as much of what is paid, a constant is close already.
+    lose about as much of the cost, a constant is close already.
     """
     cost = lp.cost[policy]
     even = _even(lp, policy, lp.gamma, cost)

@@ -12,9 +12,9 @@ from lmdsl.common.types import Floats, Pairs, TimeUp, never
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.policies import bellman, iteration
 
-STEPS, PASSES = 3, 60
-LEAST_RISE = 1e-3
-MARGIN = 1e-9
+STEPS, PASSES = 3, 60  # number of improvements, and of passes, above which it ends
+LEAST_RISE = 1e-3  # relative rise of the lower bound up to which a pass is the last
+MARGIN = 1e-9  # relative excess over V above which a column is eliminated
 
 
 def survivors(

@@ -24,8 +24,8 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.linear.policy_system import Slots, copy_row
 from lmdsl.optimize.policies import bellman
 
-LEAST_SCALE = 1e-30
-MOST = 1e308
+LEAST_SCALE = 1e-30  # scale below which all ratios are made anew
+MOST = 1e308  # value above which a rival's is kept as this one
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class Screen:
 
     @cached_property
     def slots(self) -> Slots:
-        """Room for the rows of the policy."""
+        """Memory for the rows of the policy."""
         lp = self.lp
         return Slots.of(lp.rows, lp.pair_pointer, self.gamma, lp._directions)
 

@@ -95,8 +95,9 @@ def _contents(result: Result) -> dict[str, bytes]:
     else:
         data = problem.to_dict()
     contents["problem.json"] = reading.text(data)
-    held = {name: getattr(result, name) for name in (*ARRAYS, "witness")}
-    contents["solution.npz"] = arrays.packed(held)
+    contents["solution.npz"] = arrays.packed(
+        {name: getattr(result, name) for name in (*ARRAYS, "witness")}
+    )
     return contents
 
 
@@ -219,16 +220,16 @@ def _read(files: Reading) -> Stored:
 
 
 def _result(
-    problem: Problem, partition: Partition, stored: CertificateFile, held: dict[str, NDArray[Any]]
+    problem: Problem, partition: Partition, stored: CertificateFile, loaded: dict[str, NDArray[Any]]
 ) -> Result:
     vectors = control_vectors(problem)
-    index = held["control_index"]
+    index = loaded["control_index"]
     if index.size and not (index.min() >= -1 and index.max() < len(vectors)):
         raise BadInput("control_index holds an index outside the control grid", "solution.npz")
-    if held["cell_status"].max(initial=0) > max(CellStatus):
+    if loaded["cell_status"].max(initial=0) > max(CellStatus):
         raise BadInput("cell_status holds an unknown code", "solution.npz")
-    said = dict(stored)
-    known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said} | held
+    said = dict(stored) | loaded
+    known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said}
     certificate = Certificate(
         **{claim.name: stored.claims.get(claim.name, False) for claim in CLAIMS},
         contraction=stored.contraction,

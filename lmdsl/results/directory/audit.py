@@ -27,14 +27,14 @@ NOT_CLAIMED = (
     "backend", "solver_status", "tolerance", "polish_steps", "iterations", "gap_before_polish",
     "seconds", "versions", "message", "model_sha256",
 )  # fmt: skip
-"""Keys of certificate.json that are history, wishes or text; of the digest a difference is said."""
+"""Keys of certificate.json that say history, options, text; of the digest a difference is said."""
 
 _WEAKER = {"cost": 1e-9, "lower_bound": 1e-9, "gap": 1e-3, "contraction": 1e-9}
 _ROUNDING = {
     "cost": (1e-12, 0.0), "lower_bound": (1e-12, 0.0), "gap": (0.0, 1e-15),
     "contraction": (0.0, 1e-15),
 }  # fmt: skip
-_BRACKET = 2e-8
+_BRACKET = 2e-8  # relative excess over the bracket proved anew above which it is refused
 
 
 def differences(

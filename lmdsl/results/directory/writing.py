@@ -82,12 +82,12 @@ def refuse_own_file(path: str | os.PathLike[str]) -> None:
 
 
 def _refuse_foreign(target: Path, text: str) -> None:
-    held = {name for name in os.listdir(target) if not _IGNORED.fullmatch(name)}
-    if held and not _marked(target):
+    present = {name for name in os.listdir(target) if not _IGNORED.fullmatch(name)}
+    if present and not _marked(target):
         raise BadInput(
             f"{text} is not empty and not a result directory; choose another name", "out"
         )
-    for name in held.intersection(NAMES):
+    for name in present.intersection(NAMES):
         if not stat.S_ISREG((target / name).lstat().st_mode):
             raise BadInput(f"{name} in {text} is not a regular file; choose another name", "out")
 
@@ -184,11 +184,11 @@ def _remove(work: Path) -> None:
 @contextlib.contextmanager
 def _alone(target: Path) -> Iterator[None]:
     """Wait for other saves, but not for ever, and not where locks are refused."""
-    descriptor, late = None, time.monotonic() + PATIENCE
+    descriptor, until = None, time.monotonic() + PATIENCE
     try:
         with contextlib.suppress(OSError, AttributeError):
             descriptor = os.open(target, os.O_RDONLY)
-            while not _locked(descriptor) and time.monotonic() < late:
+            while not _locked(descriptor) and time.monotonic() < until:
                 time.sleep(0.01)
         yield
     finally:
