@@ -8,8 +8,7 @@ import sys
 import time
 from types import FrameType
 
-PATIENCE = 5.0
-"""Seconds that an interrupted command has to end by itself."""
+PATIENCE = 5.0  # seconds that an interrupted command has to end by itself
 
 _ended = False
 

@@ -21,18 +21,19 @@ from lmdsl.machine.forking import forked
 if TYPE_CHECKING:
     from lmdsl.model.lp import StabilizationLP
 
+# The factorisation of every algorithm, the default first.
 ALGORITHMS = {
     "primal": "faer",
     "dual": "faer",
     "primal-qdldl": "qdldl",
     "dual-qdldl": "qdldl",
 }
-"""The factorisation of every algorithm, the default first."""
 
 TOLERANCE, LEAST_TOLERANCE = 1e-8, 1e-12
 """The default, and the relative tolerance below which no smaller one is passed on."""
 TOLERANCES = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
 
+# Every SolverStatus by name, for the primal form; one not listed is a failure.
 STOPS = {
     "Unsolved": Stop.FAILED,
     "Solved": Stop.OPTIMAL,
@@ -47,10 +48,9 @@ STOPS = {
     "InsufficientProgress": Stop.FAILED,
     "CallbackTerminated": Stop.INTERRUPTED,
 }
-"""Every SolverStatus by name, for the primal form; one not listed is a failure."""
 
+# What the dual form's infeasibility says of the primal LP.
 SWAPPED = {Stop.INFEASIBLE: Stop.UNBOUNDED, Stop.UNBOUNDED: Stop.INFEASIBLE}
-"""What the dual form's infeasibility says of the primal LP."""
 
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:

@@ -22,9 +22,9 @@ from lmdsl.machine.forking import forked
 if TYPE_CHECKING:
     from lmdsl.model.lp import StabilizationLP
 
-PREFERRED = ("HIGHS", "CLARABEL", "SCIPY")
-"""The first of these that is installed is the default."""
+PREFERRED = ("HIGHS", "CLARABEL", "SCIPY")  # the first of these that is installed is the default
 
+# Every status of cvxpy.settings; one not listed is a failure.
 STOPS = {
     "optimal": Stop.OPTIMAL,
     "optimal_inaccurate": Stop.INACCURATE,
@@ -36,19 +36,18 @@ STOPS = {
     "user_limit": Stop.ITERATION_LIMIT,
     "solver_error": Stop.FAILED,
 }
-"""Every status of cvxpy.settings; one not listed is a failure."""
 
+# Solvers of which "optimal_inaccurate" means that a limit was reached, their own included.
 INACCURATE_IS_LIMIT = ("OSQP", "SCIPY", "SCS")
-"""Solvers of which "optimal_inaccurate" means that a limit was reached, their own included."""
 
+# Options always passed.
 FIXED = {
     "HIGHS": {"solver": "ipx", "run_crossover": "off"},
     "SCIPY": {"method": "highs-ipm"},
 }
-"""Options always passed."""
 
+# Solvers that take their options as one dictionary of this name.
 NESTED = {"HIGHS": "highs_options", "SCIPY": "scipy_options"}
-"""Solvers that take their options as one dictionary of this name."""
 
 TIME_LIMIT = {
     "CLARABEL": "time_limit",
@@ -64,6 +63,7 @@ ITERATION_LIMIT = {
     "SCIPY": ("maxiter",),
     "SCS": ("max_iters",),
 }
+# Our default and the options it sets; no default is looser than CVXPY's.
 TOLERANCE = {
     "CLARABEL": (1e-8, ("tol_gap_abs", "tol_gap_rel", "tol_feas")),
     "HIGHS": (1e-8, ("ipm_optimality_tolerance",)),
@@ -71,7 +71,6 @@ TOLERANCE = {
     "SCIPY": (1e-8, ("ipm_optimality_tolerance",)),
     "SCS": (1e-7, ("eps_abs", "eps_rel")),
 }
-"""Our default and the options it sets; no default is looser than CVXPY's."""
 
 LEAST_TOLERANCE = 1e-12  # tolerance below which no smaller one is passed on
 

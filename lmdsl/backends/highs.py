@@ -22,6 +22,7 @@ from lmdsl.machine import quiet
 if TYPE_CHECKING:
     from lmdsl.model.lp import StabilizationLP
 
+# Options of every algorithm, the default first.
 ALGORITHMS = {
     "ipx": {"solver": "ipx", "run_crossover": "off"},
     "ipx-crossover": {"solver": "ipx", "run_crossover": "on"},
@@ -29,15 +30,14 @@ ALGORITHMS = {
     "hipo": {"solver": "hipo", "run_crossover": "off"},
     "pdlp": {"solver": "pdlp"},
 }
-"""Options of every algorithm, the default first."""
 
+# Our default and the least value HiGHS takes; no default is looser than its own.
 TOLERANCES = {
     "primal_feasibility_tolerance": (1e-7, 1e-10),
     "dual_feasibility_tolerance": (1e-7, 1e-10),
     "ipm_optimality_tolerance": (1e-8, 1e-12),
     "pdlp_optimality_tolerance": (1e-9, 1e-12),
 }
-"""Our default and the least value HiGHS takes; no default is looser than its own."""
 
 ITERATION_LIMITS = ("simplex_iteration_limit", "ipm_iteration_limit", "pdlp_iteration_limit")
 ITERATIONS = (
@@ -47,6 +47,7 @@ ITERATIONS = (
     "pdlp_iteration_count",
 )
 
+# Every HighsModelStatus by name; one not listed is a failure.
 STOPS = {
     "kNotset": Stop.FAILED,
     "kLoadError": Stop.FAILED,
@@ -69,7 +70,6 @@ STOPS = {
     "kHighsInterrupt": Stop.INTERRUPTED,
     "kMemoryLimit": Stop.FAILED,
 }
-"""Every HighsModelStatus by name; one not listed is a failure."""
 
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from lmdsl.model.lp import StabilizationLP
 
 
-ENTRY = 100
-"""Bytes of an entry of the matrix: SciPy's while it is made, and the copy of a solver."""
+ENTRY = 100  # bytes of an entry of the matrix: SciPy's while it is made, and the copy of a solver
 
 
 @dataclass(frozen=True, eq=False)

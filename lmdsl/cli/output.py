@@ -14,8 +14,8 @@ from lmdsl.errors import printable
 
 Arguments = argparse.Namespace
 Run = Callable[[Arguments], int]
+# Adds a command: its name, what runs it, its help.
 Command = Callable[[str, Run, str], argparse.ArgumentParser]
-"""Adds a command: its name, what runs it, its help."""
 
 SHARED: dict[str, dict[str, Any]] = {
     "file": {"metavar": "FILE", "help": "problem file"},

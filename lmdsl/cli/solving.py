@@ -11,8 +11,8 @@ from lmdsl.cli.streams import say, tell
 from lmdsl.errors import LmdslError, plain_text, printable
 from lmdsl.results.status import Status
 
+# Runs of the true map that follow a solve: how many, how long, and how long all together.
 STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
-"""Runs of the true map that follow a solve: how many, how long, and how long all together."""
 
 
 def add(command: Command) -> None:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from lmdsl.errors import BadInput, shown
 
+# Comment of the archives written here: one that was written anew by others has none.
 MARK = b"lmdsl"
-"""Comment of the archives written here: one that was written anew by others has none."""
 Expected = Mapping[str, tuple[tuple[int, ...], str]]
 
 _DIRECTORY = 256 * 2**10  # bytes read of an archive's directory; six arrays need a hundredth

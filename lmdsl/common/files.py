@@ -54,8 +54,8 @@ def write_new(path: Path, pieces: Iterable[bytes]) -> None:
                 raise
 
 
+# What fsync says on file systems that do not know it; other errors mean lost data.
 _NO_SYNC = {errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EROFS, errno.EBADF}
-"""What fsync says on file systems that do not know it; other errors mean lost data."""
 
 
 def reason(error: Exception) -> str:

@@ -72,26 +72,26 @@ class FileSchema(GenerateJsonSchema):
 
 # A bound stands directly behind its type, before any validator: only there does pydantic write it
 # as a word of JSON Schema.
+# A finite double; booleans, strings, NaN and infinities are refused.
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True), BeforeValidator(plain)]
-"""A finite double; booleans, strings, NaN and infinities are refused."""
 
+# A finite double above 0.
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True), BeforeValidator(plain)]
-"""A finite double above 0."""
 
+# A whole number of at least 1.
 Count = Annotated[int, Field(strict=True, ge=1, le=10**15), BeforeValidator(plain)]
-"""A whole number of at least 1."""
 
+# A seed of a random generator.
 Seed = Annotated[int, Field(strict=True, ge=0, lt=2**63), BeforeValidator(plain)]
-"""A seed of a random generator."""
 
+# A sequence of finite doubles, at least one.
 Numbers = Annotated[tuple[Number, ...], Field(fail_fast=True, min_length=1), BeforeValidator(plain)]
-"""A sequence of finite doubles, at least one."""
 
 frozen_dict = AfterValidator(FrozenDict)
 
 LowHigh = Annotated[tuple[Number, Number], BeforeValidator(plain)]
+# Axis name to ``[a, b]``; axes left out are unrestricted.
 Box = Annotated[dict[str, LowHigh], BeforeValidator(plain), frozen_dict]
-"""Axis name to ``[a, b]``; axes left out are unrestricted."""
 
 
 if TYPE_CHECKING:

@@ -7,17 +7,13 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Indices = NDArray[np.int64]
-"""Whole numbers, such as cells, positions or columns."""
-Statuses = NDArray[np.uint8]
-"""Codes of ``CellStatus``, by cell."""
-Pairs = NDArray[np.int64]
-"""A policy: a column per position of C, shape (n,); or any columns."""
+Indices = NDArray[np.int64]  # whole numbers, such as cells, positions or columns
+Statuses = NDArray[np.uint8]  # codes of ``CellStatus``, by cell
+Pairs = NDArray[np.int64]  # a policy: a column per position of C, shape (n,); or any columns
 
-TimeUp = Callable[[], bool]
-"""Asked now and then by what takes long: True ends the work early."""
+TimeUp = Callable[[], bool]  # asked now and then by what takes long: True ends the work early
+# Told what is being done, and which part of it, 0 to 1, is done.
 Progress = Callable[[str, float], None]
-"""Told what is being done, and which part of it, 0 to 1, is done."""
 
 
 def never() -> bool:
@@ -25,5 +21,4 @@ def never() -> bool:
     return False
 
 
-Guard = Callable[[], object]
-"""Asked during long evaluations whether to go on; it raises if not."""
+Guard = Callable[[], object]  # asked during long evaluations whether to go on; it raises if not

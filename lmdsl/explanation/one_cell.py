@@ -17,8 +17,8 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.rows import Rows
 from lmdsl.model.stabilizable_set import CellStatus
 
+# The causes as words: "escapes", "trapped", "leads to these", ...
 NAMES = {status: status.name.lower().replace("_", " ") for status in CellStatus}
-"""The causes as words: "escapes", "trapped", "leads to these", ..."""
 
 MOST_CONTROLS = 32  # number of controls above which only some are shown, evenly chosen
 MOST_BOXES = 8  # number of boxes above which a trap is shown in part

@@ -15,14 +15,12 @@ import numpy as np
 
 from lmdsl.common.types import Floats
 
-ROUNDING: Final = 2.0**-53
-"""Relative error of a correctly rounded operation."""
+ROUNDING: Final = 2.0**-53  # relative error of a correctly rounded operation
 
+# Error of a computed elementary function, in units of the last place of its value.
 FUNCTION_ULPS: Final = 4
-"""Error of a computed elementary function, in units of the last place of its value."""
 
-TINY: Final = 2.0**-1070
-"""More than a few operations lose to underflow."""
+TINY: Final = 2.0**-1070  # more than a few operations lose to underflow
 
 _FUNCTION: Final = (4 * FUNCTION_ULPS + 2) * ROUNDING  # a unit is at most 2 ROUNDING of the value
 _TOP: Final = 1.0 + _FUNCTION  # so far a computed sine may go

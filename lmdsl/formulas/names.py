@@ -15,11 +15,12 @@ def _named(value: dict[str, Any]) -> dict[str, Any]:
     return value
 
 
+# A text formula; the model that knows its names parses it.
 FormulaText = Annotated[str, SchemaWords({"minLength": 1, "maxLength": MAX_CHARACTERS})]
-"""A text formula; the model that knows its names parses it."""
 
 valid_names = AfterValidator(_named)
 
+# What `valid_names` asks for, in words of JSON Schema.
 named_keys = SchemaWords(
     {
         "propertyNames": {
@@ -29,8 +30,8 @@ named_keys = SchemaWords(
         }
     }
 )
-"""What `valid_names` asks for, in words of JSON Schema."""
 
+# Named constants of a system.
 Parameters = Annotated[
     dict[str, Number],
     Field(max_length=1000),
@@ -39,9 +40,8 @@ Parameters = Annotated[
     named_keys,
     frozen_dict,
 ]
-"""Named constants of a system."""
 
+# One formula per state.
 Formulas = Annotated[
     dict[str, FormulaText], BeforeValidator(plain), valid_names, named_keys, frozen_dict
 ]
-"""One formula per state."""

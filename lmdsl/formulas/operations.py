@@ -41,5 +41,5 @@ FORMULA_FUNCTIONS: Final[Mapping[str, int]] = MappingProxyType(
     {**{name: ufunc.nin for name, ufunc in _UFUNCS.items()}, "where": 3}
 )
 
+# Names that nothing may bear.
 RESERVED: Final = frozenset({*keyword.kwlist, *FORMULA_FUNCTIONS, *FORMULA_CONSTANTS})
-"""Names that nothing may bear."""

@@ -173,8 +173,7 @@ class Program:
         return tuple(slots[slot] for slot in self.outputs)
 
 
-FUNCTION = 40
-"""Additions that take as long as a sine or a cosine, the slowest functions there are."""
+FUNCTION = 40  # additions that take as long as a sine or a cosine, the slowest functions there are
 
 
 def _effort(operations: Sequence[str]) -> tuple[int, int]:

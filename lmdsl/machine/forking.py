@@ -25,8 +25,8 @@ def forked() -> bool:
     )
 
 
+# Held while parts of lmdsl are imported: Python keeps a lock for each module.
 whole = threading.RLock()
-"""Held while parts of lmdsl are imported: Python keeps a lock for each module."""
 
 _locks: list[Any] = [whole]
 _taken: list[Any] = []

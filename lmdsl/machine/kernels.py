@@ -30,16 +30,16 @@ from lmdsl.machine.forking import cached_property, hold
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
+# Says what is compiled (info, with ``busy``) and, once, that it cannot be kept (warning).
 log = logging.getLogger(__name__)
-"""Says what is compiled (info, with ``busy``) and, once, that it cannot be kept (warning)."""
 
+# Options of every kernel. What no kernel needs is not compiled: none divides by zero.
 OPTIONS = {
     "nogil": True, "no_cfunc_wrapper": True, "no_rewrites": True, "error_model": "numpy",
 }  # fmt: skip
-"""Options of every kernel. What no kernel needs is not compiled: none divides by zero."""
 
+# Option of Numba for what counts references to arrays: only who makes an array needs it.
 COUNTS = "_nrt"
-"""Option of Numba for what counts references to arrays: only who makes an array needs it."""
 
 
 def _started() -> tuple[Any, str]:
@@ -75,8 +75,8 @@ def _started() -> tuple[Any, str]:
 numba, _unusable = _started()
 if numba:
     hold(numba.core.compiler_lock.global_compiler_lock)
+# The most threads that may be used: ``NUMBA_NUM_THREADS``.
 threads = numba.config.NUMBA_NUM_THREADS if numba else 1
-"""The most threads that may be used: ``NUMBA_NUM_THREADS``."""
 
 
 def kernel(function: Any = None, allocates: bool = False) -> Any:

@@ -10,8 +10,7 @@ from lmdsl.common.types import Floats, Indices
 from lmdsl.machine import memory
 from lmdsl.problem.problem import Problem
 
-NODE = 400
-"""Bytes for each noise node: its values, its weight, and what orders them."""
+NODE = 400  # bytes for each noise node: its values, its weight, and what orders them
 
 
 def offsets(problem: Problem) -> Floats:

@@ -33,8 +33,7 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 
-Levels = tuple[NDArray[np.int32], Indices]
-"""Level and first stabilizing column of every cell."""
+Levels = tuple[NDArray[np.int32], Indices]  # level and first stabilizing column of every cell
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
     from matplotlib.figure import Figure
 
-PAGE = 2e8
-"""Bytes for a page as pixels, and for matplotlib."""
+PAGE = 2e8  # bytes for a page as pixels, and for matplotlib
 
 FORMATS = ("png", "pdf", "svg")
 

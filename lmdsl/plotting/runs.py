@@ -21,8 +21,7 @@ from lmdsl.results.result import Result
 from lmdsl.systems.base import OdeSystem
 from lmdsl.systems.named import NamedOde
 
-PIECES = 8
-"""Drawn lines of a differential equation have so many pieces a step."""
+PIECES = 8  # drawn lines of a differential equation have so many pieces a step
 
 Map = Callable[[Floats, Floats], Floats]
 

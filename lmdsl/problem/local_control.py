@@ -15,11 +15,11 @@ NamedNumbers = Annotated[dict[str, Number], BeforeValidator(plain), frozen_dict]
 
 PositiveNumbers = Annotated[dict[str, Positive], BeforeValidator(plain), frozen_dict]
 
+# One number for all points of an orbit, or one for each.
 PerPoint = Annotated[
     Annotated[Number, Tag("<a>")] | Annotated[Numbers, Tag("<b>")],
     Discriminator(lambda v: "<b>" if isinstance(v, list | tuple | np.ndarray) else "<a>"),
 ]
-"""One number for all points of an orbit, or one for each."""
 
 AlongOrbit = Annotated[dict[str, PerPoint], BeforeValidator(plain), frozen_dict]
 

@@ -21,8 +21,8 @@ from lmdsl.results.result import Result
 from lmdsl.results.solving import TOLERANCE, solve
 from lmdsl.results.status import Status
 
+# Compared where none is named: those that every installation has.
 BACKENDS = ("policy-iteration", "highs", "clarabel", "cvxpy")
-"""Compared where none is named: those that every installation has."""
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ A format NAME is a module ``lmdsl/results/exports/NAME.py`` with ``write(result,
 line here. Nothing is imported before it is asked for.
 """
 
+# For whom each format is, by name.
 FORMATS = {
     "certificate": "to be checked alone",
     "drn": "for Storm",
 }
-"""For whom each format is, by name."""

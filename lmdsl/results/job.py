@@ -22,8 +22,7 @@ from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Coverage, Seconds
 
-UNKNOWN = 255
-"""Status of cells of which nothing is known."""
+UNKNOWN = 255  # status of cells of which nothing is known
 
 
 def not_compiled(

@@ -18,9 +18,9 @@ from lmdsl.systems.van_der_pol import VanDerPol as VanDerPol
 from lmdsl.systems.lorenz import Lorenz as Lorenz
 # isort: on
 
+# Every system known by name, by its ``kind``.
 NAMED: dict[str, type[NamedSystem]] = {
     str(system.model_fields["kind"].default): system
     for system in list(globals().values())
     if isinstance(system, type) and issubclass(system, NamedSystem) and system is not NamedSystem
 }
-"""Every system known by name, by its ``kind``."""

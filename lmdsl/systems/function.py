@@ -17,12 +17,12 @@ from lmdsl.machine.surroundings import restore_rounding
 from lmdsl.systems.base import StateMap, System
 
 WHERE = "system.next"
+# Samples that are also asked for one by one: before a compilation, and of every block of it.
 ALONE, OF_BLOCK = 8, 2
-"""Samples that are also asked for one by one: before a compilation, and of every block of it."""
 
+# Differences that are rounding: of the same call twice, and of a sample among others and alone (an
+# integrator may choose its steps for all), in parts of the spread of the images.
 REPEATED, APART = 1e-12, 1e-3
-"""Differences that are rounding: of the same call twice, and of a sample among others and alone
-(an integrator may choose its steps for all), in parts of the spread of the images."""
 
 
 class FunctionSystem(System):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from lmdsl.testing import answers, conduct
 from lmdsl.testing.probe import Probe
 
+# All checks, in order; ``solution`` is last, for it speaks of the solves of all others.
 CHECKS: dict[str, Callable[[Probe], None]] = {
     "requires": conduct.requires,
     "algorithms": conduct.algorithms,
@@ -34,4 +35,3 @@ CHECKS: dict[str, Callable[[Probe], None]] = {
     "deterministic": conduct.deterministic,
     "solution": conduct.solution,
 }
-"""All checks, in order; ``solution`` is last, for it speaks of the solves of all others."""

@@ -15,11 +15,9 @@ from lmdsl.machine import quiet
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.testing.known import Known
 
-ACCURACY = 1e-5
-"""Largest relative error of an answer that was asked for without a tolerance."""
+ACCURACY = 1e-5  # largest relative error of an answer that was asked for without a tolerance
 
-REDUCED_ACCURACY = 1e-3
-"""The same where the backend says INACCURATE."""
+REDUCED_ACCURACY = 1e-3  # the same where the backend says INACCURATE
 
 
 class Broken(Exception):

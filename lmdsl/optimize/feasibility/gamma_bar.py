@@ -46,11 +46,11 @@ from lmdsl.optimize.feasibility.infeasible import (
 from lmdsl.optimize.feasibility.spectral_radius import PolicyClasses
 from lmdsl.problem.problem import Problem
 
+# How far beyond the limit of a policy optimal stopping is asked where doubles decide no nearer.
 FARTHER = (1e-5, 1e-3, 0.1, 1.0)
-"""How far beyond the limit of a policy optimal stopping is asked where doubles decide no nearer."""
 
+# Relative width down to which the bracket is halved, so often before it is tried to close.
 COARSE, HALVINGS = 1e-2, 2
-"""Relative width down to which the bracket is halved, so often before it is tried to close."""
 
 
 @dataclass(frozen=True, eq=False)

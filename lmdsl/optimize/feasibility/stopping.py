@@ -10,8 +10,7 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.linear import equations
 from lmdsl.optimize.policies import bellman
 
-LEAST_UNIT = 1e-140
-"""Least unit of a component: quotients of two stay within doubles."""
+LEAST_UNIT = 1e-140  # least unit of a component: quotients of two stay within doubles
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,8 @@ from lmdsl.optimize.linear.gauss_seidel import CEILING
 MAX_FACTORED = 100_000  # number of cells above which a class is not factored
 DENSE = 50  # number of cells above which a class is factored as a sparse matrix
 
+# Filters of warnings belong to the process: one thread at a time changes and restores them.
 _filtering = threading.Lock()
-"""Filters of warnings belong to the process: one thread at a time changes and restores them."""
 
 
 def solve_by_class(M: Any, b: Floats, time_up: TimeUp = never) -> tuple[Floats | None, bool]:

@@ -44,8 +44,8 @@ TYPES = {
     "cell_status": "|u1",
     "witness": "<f8",
 }
+# What a directory can hold of ours; the figures are written by ``plot``.
 FILES = (*reading.NAMES, "figures.png")
-"""What a directory can hold of ours; the figures are written by ``plot``."""
 MODEL = ("pair_pointer", "control", "pointer", "target", "code", "cost")
 
 

@@ -20,15 +20,14 @@ from lmdsl.results.summary import Seconds
 SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
 
 T = TypeVar("T")
-Word = Annotated[T, Field(strict=False)]
-"""A member of an enum, by its value."""
+Word = Annotated[T, Field(strict=False)]  # a member of an enum, by its value
 List = Annotated[tuple[T, ...], BeforeValidator(plain)]
+# A number, or ``"inf"``.
 Bound = Annotated[
     float,
     Field(allow_inf_nan=True),
     BeforeValidator(lambda value: math.inf if value == "inf" else value),
 ]
-"""A number, or ``"inf"``."""
 
 
 class _Keys(Declared):

@@ -38,12 +38,11 @@ try:
 except ImportError:  # pragma: no cover
     fcntl = None  # type: ignore[assignment]
 
-PATIENCE = 10.0
-"""Seconds that a save waits for another one."""
+PATIENCE = 10.0  # seconds that a save waits for another one
 _HIDDEN = re.compile(rf"\.({'|'.join(map(re.escape, NAMES))})\.({SAVE})")
 _LITTER = r"\.DS_Store|Thumbs\.db|desktop\.ini|lost\+found|\._.*|\.nfs.*|\.fuse_hidden.*"
+# What killed saves, and systems on their own account, put into folders.
 _IGNORED = re.compile(f"{_HIDDEN.pattern}|{_LITTER}")
-"""What killed saves, and systems on their own account, put into folders."""
 
 
 def place(path: str | os.PathLike[str]) -> Path:
