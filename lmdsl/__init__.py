@@ -69,13 +69,8 @@ _HOME = {
     "solve": "results.solving",
     "verify": "results.verification",
 }
-_PACKAGES = {
-    "backends": "backends",
-    "exports": "results.exports",
-    "plotting": "plotting",
-    "systems": "systems",
-    "testing": "testing",
-}
+_PACKAGES = {name: name for name in ("backends", "plotting", "systems", "testing")}
+_PACKAGES["exports"] = "results.exports"
 
 __all__ = ["__version__", *_HOME, *_PACKAGES]
 

@@ -7,14 +7,6 @@ from lmdsl.backends.registry import get, installed, missing, names, resolve
 from lmdsl.backends.registry import ours as ours
 
 __all__ = [
-    "Backend",
-    "Capabilities",
-    "Options",
-    "Solution",
-    "Stop",
-    "get",
-    "installed",
-    "missing",
-    "names",
-    "resolve",
-]
+    "Backend", "Capabilities", "Options", "Solution", "Stop", "get", "installed", "missing",
+    "names", "resolve",
+]  # fmt: skip

@@ -27,8 +27,8 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.policies import presolve
 from lmdsl.optimize.policies.iteration import Iteration
 
+# Number of iterations above which it is no count, and no number that JSON keeps.
 MOST_ITERATIONS = 2**53
-"""Number of iterations above which it is no count, and no number that JSON keeps."""
 
 
 def ask(

@@ -29,8 +29,8 @@ ALGORITHMS = {
     "dual-qdldl": "qdldl",
 }
 
+# The default, and the relative tolerance below which no smaller one is passed on.
 TOLERANCE, LEAST_TOLERANCE = 1e-8, 1e-12
-"""The default, and the relative tolerance below which no smaller one is passed on."""
 TOLERANCES = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
 
 # Every SolverStatus by name, for the primal form; one not listed is a failure.

@@ -48,27 +48,21 @@ ITERATIONS = (
 )
 
 # Every HighsModelStatus by name; one not listed is a failure.
+FAILURES = (
+    "kNotset", "kLoadError", "kModelError", "kPresolveError", "kSolveError", "kPostsolveError",
+    "kModelEmpty", "kObjectiveBound", "kObjectiveTarget", "kUnknown", "kSolutionLimit",
+    "kMemoryLimit",
+)  # fmt: skip
 STOPS = {
-    "kNotset": Stop.FAILED,
-    "kLoadError": Stop.FAILED,
-    "kModelError": Stop.FAILED,
-    "kPresolveError": Stop.FAILED,
-    "kSolveError": Stop.FAILED,
-    "kPostsolveError": Stop.FAILED,
-    "kModelEmpty": Stop.FAILED,
     "kOptimal": Stop.OPTIMAL,
     "kInfeasible": Stop.INFEASIBLE,
     "kUnboundedOrInfeasible": Stop.INFEASIBLE,  # costs are >= 0: it cannot be unbounded
     "kUnbounded": Stop.UNBOUNDED,
-    "kObjectiveBound": Stop.FAILED,
-    "kObjectiveTarget": Stop.FAILED,
     "kTimeLimit": Stop.TIME_LIMIT,
     "kIterationLimit": Stop.ITERATION_LIMIT,
-    "kUnknown": Stop.FAILED,
-    "kSolutionLimit": Stop.FAILED,
     "kInterrupt": Stop.INTERRUPTED,
     "kHighsInterrupt": Stop.INTERRUPTED,
-    "kMemoryLimit": Stop.FAILED,
+    **dict.fromkeys(FAILURES, Stop.FAILED),
 }
 
 

@@ -44,27 +44,21 @@ ITERATIONS, MOST_ITERATIONS = 500, 2**31 - 1
 RAY = 1e-9
 """Largest entry of A'y that counts as zero where the largest of y is 1."""
 
+FAILURES = (
+    "Search_Direction_Becomes_Too_Small", "Diverging_Iterates", "Feasible_Point_Found",
+    "Restoration_Failed", "Error_In_Step_Computation", "Not_Enough_Degrees_Of_Freedom",
+    "Invalid_Problem_Definition", "Invalid_Option", "Invalid_Number_Detected",
+    "Unrecoverable_Exception", "NonIpopt_Exception_Thrown", "Insufficient_Memory", "Internal_Error",
+)  # fmt: skip
 STOPS = {
     "Solve_Succeeded": Stop.OPTIMAL,
     "Solved_To_Acceptable_Level": Stop.INACCURATE,
     "Infeasible_Problem_Detected": Stop.INFEASIBLE,
-    "Search_Direction_Becomes_Too_Small": Stop.FAILED,
-    "Diverging_Iterates": Stop.FAILED,
     "User_Requested_Stop": Stop.INTERRUPTED,
-    "Feasible_Point_Found": Stop.FAILED,
     "Maximum_Iterations_Exceeded": Stop.ITERATION_LIMIT,
-    "Restoration_Failed": Stop.FAILED,
-    "Error_In_Step_Computation": Stop.FAILED,
     "Maximum_CpuTime_Exceeded": Stop.TIME_LIMIT,
     "Maximum_WallTime_Exceeded": Stop.TIME_LIMIT,
-    "Not_Enough_Degrees_Of_Freedom": Stop.FAILED,
-    "Invalid_Problem_Definition": Stop.FAILED,
-    "Invalid_Option": Stop.FAILED,
-    "Invalid_Number_Detected": Stop.FAILED,
-    "Unrecoverable_Exception": Stop.FAILED,
-    "NonIpopt_Exception_Thrown": Stop.FAILED,
-    "Insufficient_Memory": Stop.FAILED,
-    "Internal_Error": Stop.FAILED,
+    **dict.fromkeys(FAILURES, Stop.FAILED),
 }
 """Every ApplicationReturnStatus by CasADi's name; one not listed is a failure."""
 

@@ -11,6 +11,7 @@ from lmdsl.cli.streams import say, tell
 from lmdsl.errors import LmdslError, plain_text, printable
 from lmdsl.results.status import Status
 
+OPTIONS = ("tolerance", "time_limit", "max_iterations", "require_all", "restrict_to_gamma")
 # Runs of the true map that follow a solve: how many, how long, and how long all together.
 STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
 
@@ -64,16 +65,8 @@ def _solve(parsed: Arguments) -> int:
     from lmdsl.results.solving import solve
 
     with ProgressLine() as progress:
-        result = solve(
-            problem,
-            parsed.backend,
-            tolerance=parsed.tolerance,
-            time_limit=parsed.time_limit,
-            max_iterations=parsed.max_iterations,
-            require_all=parsed.require_all,
-            restrict_to_gamma=parsed.restrict_to_gamma,
-            progress=progress,
-        )
+        options = {name: getattr(parsed, name) for name in OPTIONS}
+        result = solve(problem, parsed.backend, progress=progress, **options)
     tell(result.log)
     if not parsed.json:  # reported first: whatever saving meets, the answer was given
         say(_summary(result))
@@ -129,12 +122,9 @@ def _compare(parsed: Arguments) -> int:
     names = [name.strip() for name in parsed.backends.split(",") if name.strip()]
     with ProgressLine() as progress:
         comparison = compare(
-            problem,
-            names,
-            tolerance=parsed.tolerance,
-            time_limit=parsed.time_limit,
+            problem, names, tolerance=parsed.tolerance, time_limit=parsed.time_limit,
             progress=progress,
-        )
+        )  # fmt: skip
     for result in comparison.results:
         tell(result.log)
     answer(parsed, comparison)

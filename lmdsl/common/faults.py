@@ -52,7 +52,7 @@ def condensed(error: ValidationError, model: Any) -> BadInput:
     """Return all faults of pydantic's report on a model as one error; misspelt keys come first."""
     faults = [_fault(item, model) for item in error.errors(include_url=False)]
     meant = {fault.meant for fault in faults if fault.meant}
-    faults = [fault for fault in faults if fault.where not in meant or not _missing(fault)]
+    faults = [fault for fault in faults if fault.where not in meant or fault.message != _ADD]
     first, *others = sorted(faults, key=lambda fault: fault.meant is None)
     message = first.message
     for k, fault in enumerate(others):
@@ -60,10 +60,6 @@ def condensed(error: ValidationError, model: Any) -> BadInput:
             return BadInput(f"{message}; and {len(others) - k} more", first.where)
         message += f"; {fault}"
     return BadInput(message, first.where)
-
-
-def _missing(fault: _Fault) -> bool:
-    return fault.message == _ADD
 
 
 def _fault(item: Mapping[str, Any], model: type[BaseModel]) -> _Fault:
@@ -118,7 +114,8 @@ def _inside(kind: Any, part: int | str) -> Iterator[Any]:
     """Yield the types one step further; a tag in angle brackets chooses of a union."""
     if isinstance(part, str) and part.startswith("<"):
         for member in _members(kind):
-            if part in [extra.tag for extra in _extras(member) if isinstance(extra, Tag)]:
+            extras = get_args(member)[1:] if get_origin(member) is Annotated else ()
+            if part in [extra.tag for extra in extras if isinstance(extra, Tag)]:
                 yield member
         return
     for member in _members(kind):
@@ -140,10 +137,6 @@ def _members(kind: Any) -> list[Any]:
 
 def _bare(kind: Any) -> Any:
     return get_args(kind)[0] if get_origin(kind) is Annotated else kind
-
-
-def _extras(kind: Any) -> tuple[Any, ...]:
-    return get_args(kind)[1:] if get_origin(kind) is Annotated else ()
 
 
 def _is_model(kind: Any) -> bool:

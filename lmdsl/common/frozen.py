@@ -22,7 +22,7 @@ class Frozen:
     """
 
     def __post_init__(self) -> None:
-        freeze(*(x for x in self._parts() if isinstance(x, np.ndarray)))
+        freeze(*(x for x in self.__getstate__().values() if isinstance(x, np.ndarray)))
 
     def __eq__(self, other: object) -> bool:
         if self is other:
@@ -37,15 +37,12 @@ class Frozen:
     def _compared(self) -> list[Any]:
         return [getattr(self, field.name) for field in fields(self) if field.compare]  # type: ignore[arg-type]
 
-    def _parts(self) -> list[Any]:
-        return [getattr(self, field.name) for field in fields(self)]  # type: ignore[arg-type]
-
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
-        freeze(*(x for x in self._parts() if isinstance(x, np.ndarray)))
+        freeze(*(x for x in self.__getstate__().values() if isinstance(x, np.ndarray)))
 
 
 def _equal(a: Any, b: Any) -> bool:

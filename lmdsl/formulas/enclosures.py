@@ -85,11 +85,7 @@ class Jet:
     def __neg__(self) -> Jet:
         return Jet(iv.negative(self.value), iv.negative(self.slope), self.error)
 
-    def __rmul__(self, other: Any) -> Jet:
-        return self.__mul__(other)
-
-    def __radd__(self, other: Any) -> Jet:
-        return self.__add__(other)
+    __radd__, __rmul__ = __add__, __mul__
 
     def __rsub__(self, other: Any) -> Jet:
         return _jet(other, self) - self

@@ -122,20 +122,18 @@ class Uncollected(numba.core.event.Listener if numba else object):  # type: igno
 
     def on_start(self, event: Any) -> None:
         """Note that a kernel is compiled, perhaps for another one."""
-        if not _is_kernel(event.data["dispatcher"]):
-            return
-        if not self.depth:
-            self.enabled = gc.isenabled()
-            gc.disable()
-        self.depth += 1
+        if _is_kernel(event.data["dispatcher"]):
+            if not self.depth:
+                self.enabled = gc.isenabled()
+                gc.disable()
+            self.depth += 1
 
     def on_end(self, event: Any) -> None:
         """Note that it is compiled."""
-        if not _is_kernel(event.data["dispatcher"]):
-            return
-        self.depth -= 1
-        if not self.depth and self.enabled:
-            gc.enable()
+        if _is_kernel(event.data["dispatcher"]):
+            self.depth -= 1
+            if not self.depth and self.enabled:
+                gc.enable()
 
 
 def _is_kernel(compiled: Any) -> bool:

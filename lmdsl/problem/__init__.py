@@ -9,21 +9,7 @@ from lmdsl.problem.sampling import Grid, Random, Sobol
 from lmdsl.problem.sets import Attractor, Avoid, Measure
 
 __all__ = [
-    "Attractor",
-    "Avoid",
-    "Axis",
-    "ConstantControl",
-    "ControlRange",
-    "ControlValues",
-    "Grid",
-    "LinearFeedback",
-    "LqrFeedback",
-    "Measure",
-    "NoiseNormal",
-    "NoiseValues",
-    "Problem",
-    "Random",
-    "Sobol",
-    "json_schema",
-    "load",
-]
+    "Attractor", "Avoid", "Axis", "ConstantControl", "ControlRange", "ControlValues", "Grid",
+    "LinearFeedback", "LqrFeedback", "Measure", "NoiseNormal", "NoiseValues", "Problem", "Random",
+    "Sobol", "json_schema", "load",
+]  # fmt: skip

@@ -21,7 +21,6 @@ from lmdsl.machine.deadline import Stopped
 from lmdsl.optimize.linear import extrapolation
 from lmdsl.optimize.linear.classes import _spread, solve_by_class
 from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, TOLERANCE, SplitMatrix
-from lmdsl.optimize.linear.krylov import _bicgstab
 from lmdsl.optimize.linear.substitution import Peeled
 
 TRIAL_SWEEPS = 60  # number of sweeps after which it is asked how fast they converge
@@ -238,7 +237,9 @@ def _krylov(
         if not 0 < unit < CEILING:
             return None
         known, steps = swept(b / unit, zero), min(KRYLOV_STEPS, KRYLOV_SWEEPS // (2 * count))
-        y = _bicgstab(lambda v: v - swept(zero, v), known, x / unit, steps, time_up, enough)
+        y = extrapolation.bicgstab(
+            lambda v: v - swept(zero, v), known, x / unit, steps, time_up, enough
+        )
         guess = np.maximum(unit * y, b)
     if not (guess < CEILING).all() or y.min() < -1e-9 * y.max():
         return None

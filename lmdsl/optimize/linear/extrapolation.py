@@ -1,12 +1,17 @@
-"""Extrapolation along the one mode in which sweeps stall: the slow escape from a well-mixed set.
+"""Where sweeps stall: extrapolation along one mode, and BiCGSTAB, a Krylov method, on sweeps.
 
-Both take a few Jacobi steps, after which the residual is nearly that mode, and go as far along it
-as every component allows: down to just above the solution of x = b + M x, or up to above it.
+One mode, such as the slow escape from a well-mixed set, is what hinders most. The first two take a few
+Jacobi steps, after which the residual is nearly that mode, and go as far along it as every
+component allows: down to just above the solution of x = b + M x, or up to above it.
 """
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, TimeUp
+from lmdsl.machine.deadline import Stopped
 from lmdsl.optimize.linear.gauss_seidel import CEILING, SplitMatrix
 
 SWEEPS, STEPS = 4, 16  # number of sweeps, and of Jacobi steps, before extrapolating
@@ -64,3 +69,40 @@ def lift(system: SplitMatrix, b: Floats, x: Floats) -> bool:
 def _moved(system: SplitMatrix, v: Floats) -> Floats:
     """Return D^-1 (M - own) v with D = 1 - own, own the diagonal of M: one Jacobi step."""
     return system.inverse * system.times(v)
+
+
+def bicgstab(
+    applied: Callable[[Floats], Floats],
+    b: Floats,
+    x: Floats,
+    steps: int,
+    time_up: TimeUp,
+    enough: float,
+) -> Floats:
+    """Solve applied(x) = b to a relative residual ``enough``, or make so many steps."""
+
+    def dot(u: Floats, v: Floats) -> Any:
+        return (u * v).sum()
+
+    x = np.where(np.isfinite(x), x, 0.0)
+    r = b - applied(x)
+    shadow, p, rho = r, r, dot(r, r)
+    least = enough * enough * dot(b, b)
+    for _ in range(steps):
+        if not dot(r, r) > least or rho == 0.0:
+            break
+        if time_up():
+            raise Stopped
+        q = applied(p)
+        alpha = rho / dot(shadow, q)
+        s = r - alpha * q
+        t = applied(s)
+        omega = dot(t, s) / dot(t, t) if t.any() else np.float64(0.0)
+        following = x + alpha * p + omega * s
+        if not np.isfinite(following).all():
+            break
+        x = following
+        r = s - omega * t
+        before, rho = rho, dot(shadow, r)
+        p = r + (rho / before) * (alpha / omega) * (p - omega * q)
+    return x
