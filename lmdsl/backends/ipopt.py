@@ -26,6 +26,7 @@ from lmdsl.backends.scaled import ScaledLP, failure
 if TYPE_CHECKING:
     from lmdsl.model.lp import StabilizationLP
 
+# Options always passed.
 FIXED = {
     "mehrotra_algorithm": "yes",
     "jac_c_constant": "yes",
@@ -34,15 +35,12 @@ FIXED = {
     "print_level": 0,
     "sb": "yes",
 }
-"""Options always passed."""
 
+# The default, and the relative tolerance below which no smaller one is passed on.
 TOLERANCE, LEAST_TOLERANCE = 1e-9, 1e-12
-"""The default, and the relative tolerance below which no smaller one is passed on."""
-ITERATIONS, MOST_ITERATIONS = 500, 2**31 - 1
-"""Our limit, and the largest that Ipopt takes."""
+ITERATIONS, MOST_ITERATIONS = 500, 2**31 - 1  # our limit, and the largest that Ipopt takes
 
-RAY = 1e-9
-"""Largest entry of A'y that counts as zero where the largest of y is 1."""
+RAY = 1e-9  # largest entry of A'y that counts as zero where the largest of y is 1
 
 FAILURES = (
     "Search_Direction_Becomes_Too_Small", "Diverging_Iterates", "Feasible_Point_Found",
@@ -50,6 +48,7 @@ FAILURES = (
     "Invalid_Problem_Definition", "Invalid_Option", "Invalid_Number_Detected",
     "Unrecoverable_Exception", "NonIpopt_Exception_Thrown", "Insufficient_Memory", "Internal_Error",
 )  # fmt: skip
+# Every ApplicationReturnStatus by CasADi's name; one not listed is a failure.
 STOPS = {
     "Solve_Succeeded": Stop.OPTIMAL,
     "Solved_To_Acceptable_Level": Stop.INACCURATE,
@@ -60,7 +59,6 @@ STOPS = {
     "Maximum_WallTime_Exceeded": Stop.TIME_LIMIT,
     **dict.fromkeys(FAILURES, Stop.FAILED),
 }
-"""Every ApplicationReturnStatus by CasADi's name; one not listed is a failure."""
 
 
 def solve(lp: StabilizationLP, options: Options) -> Solution:

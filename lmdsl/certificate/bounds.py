@@ -19,15 +19,15 @@ from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.vectors import over_cells, padded
 
+# Size of a sum above which it is not believed: one that rounds to infinity exceeds everything.
 LARGEST = 2.0**1000
-"""Size of a sum above which it is not believed: one that rounds to infinity exceeds everything."""
+# Factor with which a row holds whatever rounding does; number of entries from which on it may not:
+# 4,016 u < 1e-12.
 CLEAR, LONG = 1.0 - 1e-12, 4_000
-"""Factor with which a row holds whatever rounding does; number of entries from which on it may not:
-4,016 u < 1e-12."""
+# Number of rows above which none is decided with exact rationals: they take about 0.4 s.
 MAX_EXACT = 20_000
-"""Number of rows above which none is decided with exact rationals: they take about 0.4 s."""
+# In place of arrays for results that are not asked for.
 NO_BOUNDS, NO_PAIRS = np.empty(0), np.empty(0, dtype=np.int64)
-"""In place of arrays for results that are not asked for."""
 
 
 def expected_above(lp: StabilizationLP, policy: Pairs, x: Floats, gamma: float) -> Floats:

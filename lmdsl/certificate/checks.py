@@ -12,8 +12,8 @@ from lmdsl.model.lp import StabilizationLP
 
 MEASURE_TOLERANCE = 1e-9  # residual of mu relative to its size above which it is refused
 
+# Number of transitions of a policy above which none is judged exactly: 0.5 s a claim.
 MOST_EXACT = 200_000
-"""Number of transitions of a policy above which none is judged exactly: 0.5 s a claim."""
 
 
 def check_stabilizing(lp: StabilizationLP, policy: Pairs, w: Floats) -> float | None:

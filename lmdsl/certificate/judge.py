@@ -15,8 +15,7 @@ from lmdsl.machine import threads
 from lmdsl.model.algorithm_1 import reaches_attractor
 from lmdsl.model.lp import StabilizationLP
 
-PARALLEL_FROM = 10_000
-"""Number of cells from which on two claims are judged in two threads."""
+PARALLEL_FROM = 10_000  # number of cells from which on two claims are judged in two threads
 
 
 class About(Enum):
@@ -112,8 +111,8 @@ REFUSAL = Claim(
     "refusal", About.NO_POLICY, "refusal", _refusal, exact_checks.refusal,
     lambda lp, *_: f"proved: no policy has finite cost at gamma = {lp.gamma!r}",
 )  # fmt: skip
+# In the order of certificate.json.
 CLAIMS = (STABILIZING, UPPER_BOUND, LOWER_BOUND, MEASURE, REFUSAL)
-"""In the order of certificate.json."""
 
 
 def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:

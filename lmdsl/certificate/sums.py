@@ -16,8 +16,8 @@ UNIT = 1.1 * 2.0**-53  # relative error of a rounded operation, and a tenth
 LEAST = 2.0**-1074  # the least positive double
 NORMAL = sys.float_info.min  # the least double of full precision
 LARGEST = Fraction(sys.float_info.max)
+# Products of two numbers in between are normal doubles, and so are their rounding errors.
 LOW, HIGH = 2.0**-450, 2.0**450
-"""Products of two numbers in between are normal doubles, and so are their rounding errors."""
 MOST_EXACT_TERMS = 1_000  # number of terms above which sums are made by NumPy
 BITS = 2 * 1074  # binary places of a product of two doubles
 

@@ -10,9 +10,10 @@ from pydantic import BaseModel, Tag, ValidationError
 from lmdsl.common.files import joined
 from lmdsl.errors import BadInput, shown
 
+# Number of characters of a message above which further faults are counted only.
 MOST_CHARACTERS = 900
-"""Number of characters of a message above which further faults are counted only."""
 
+# What to do about each kind of fault that pydantic finds.
 _FIXES = {
     "bool_type": "write true or false",
     "callable_type": "give a function",
@@ -33,7 +34,6 @@ _FIXES = {
     "too_short": "give at least {min_length} of them",
     "tuple_type": "write a list in brackets",
 }
-"""What to do about each kind of fault that pydantic finds."""
 
 _ADD = "required key is missing; add it"
 

@@ -10,8 +10,8 @@ import numpy as np
 from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput, shown
 
+# Number above which a count is refused: exact as a double, and more than can ever be done.
 MOST = 10**15
-"""Number above which a count is refused: exact as a double, and more than can ever be done."""
 
 
 def whole(value: Any, where: str, least: int = 1, most: float = MOST) -> int:

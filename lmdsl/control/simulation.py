@@ -12,8 +12,7 @@ from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 
-FEW = 0.01
-"""Share of runs that miss the attractor above which the samples are called too few."""
+FEW = 0.01  # share of runs that miss the attractor above which the samples are called too few
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,13 +32,13 @@ from lmdsl.model.discretization import control_values
 from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 
+# Steps of a run; share of the axis above which a side is left too far; share of cells below which a
+# hint has no support; share of them for which its numbers suffice.
 STEPS, NEAR, SUPPORT, QUANTILE = 64, 0.25, 0.05, 0.9
-"""Steps of a run; share of the axis above which a side is left too far; share of cells below which
-a hint has no support; share of them for which its numbers suffice."""
+# Numbers above which only so many of them are tried, evenly chosen.
 MOST_CELLS, MOST_CONTROLS, MOST_POINTS, MOST_NODES = 512, 64, 16, 4
-"""Numbers above which only so many of them are tried, evenly chosen."""
+# How far beyond the end of a control's range is tried, in lengths of the range.
 BEYOND = (0.0, 0.125, 0.25, 0.5, 1.0)
-"""How far beyond the end of a control's range is tried, in lengths of the range."""
 
 
 @dataclass(frozen=True)

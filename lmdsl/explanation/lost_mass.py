@@ -37,8 +37,7 @@ from lmdsl.model.stabilizable_set import CellStatus
 
 SMALL = 1e-6  # share of the mass up to which a loss counts as none
 MOST_CELLS = 100  # number of cells above which only the largest losses are listed
-BYTES = 150
-"""Bytes per entry of the LP: SciPy's copies and the factors of HiGHS, roughly."""
+BYTES = 150  # bytes per entry of the LP: SciPy's copies and the factors of HiGHS, roughly
 
 
 @dataclass(frozen=True, repr=False, eq=False)

@@ -21,12 +21,11 @@ from lmdsl.machine.deadline import Deadline
 
 T = TypeVar("T")
 
+# Number of entries of a matrix from which on native calls have a process of their own, with or
+# without a deadline.
 LARGE = 50_000
-"""Number of entries of a matrix from which on native calls have a process of their own, with or
-without a deadline."""
 
-GRACE = 1.0
-"""Seconds after the deadline in which a solver may still say what it found."""
+GRACE = 1.0  # seconds after the deadline in which a solver may still say what it found
 
 
 class Ended(LmdslError):

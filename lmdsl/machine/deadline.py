@@ -15,8 +15,7 @@ class TimeLimitReached(LmdslError, TimeoutError):
         super().__init__(f"time limit reached while {doing}; raise the limit or make less work")
 
 
-FOREVER = 1e10
-"""Number of seconds above which a limit counts as this one: three centuries."""
+FOREVER = 1e10  # number of seconds above which a limit counts as this one: three centuries
 
 
 class Deadline:

@@ -19,12 +19,11 @@ from typing import Any
 
 from lmdsl.machine import forking
 
-KEPT = 65_536
-"""Number of bytes of a log above which only the last ones are kept."""
+KEPT = 65_536  # number of bytes of a log above which only the last ones are kept
 
 _lock = threading.RLock()
+# Held while the streams are diverted or put back: no fork may happen in the middle.
 _turn = threading.RLock()
-"""Held while the streams are diverted or put back: no fork may happen in the middle."""
 forking.hold(_turn)
 _here = threading.local()
 _diverted: "_Diverted | None" = None

@@ -72,14 +72,13 @@ def tree(
     return _tree(pair_pointer, rows, allowed)
 
 
+# Number of visits per entry above which predecessors are made: they cost about as much.
 PATIENCE = 8
-"""Number of visits per entry above which predecessors are made: they cost about as much."""
 
-PARTS = 16
-"""Number of ranges of cells that threads work on."""
+PARTS = 16  # number of ranges of cells that threads work on
 
+# Number of entries of rows from which on ranges of cells are searched in threads.
 PARALLEL_FROM = 2**20
-"""Number of entries of rows from which on ranges of cells are searched in threads."""
 
 
 def _tree(

@@ -23,8 +23,8 @@ from lmdsl.machine import threads
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.discretization import Nodes
 
+# Number of ranges for threads, and number of rows from which on they are made.
 PARTS, PARALLEL_FROM = 8, 10_000
-"""Number of ranges for threads, and number of rows from which on they are made."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,11 +17,9 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid.partition import Partition
 from lmdsl.problem.problem import Problem
 
-CELL = 32
-"""Bytes of a cell while the sets are made."""
+CELL = 32  # bytes of a cell while the sets are made
 
-PART = 2**16
-"""Number of cells of which the density is evaluated at a time."""
+PART = 2**16  # number of cells of which the density is evaluated at a time
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from lmdsl.model.lp import StabilizationLP
 
 T = TypeVar("T")
 
+# Number of transitions above which another range of cells, and thread, is worth it.
 TRANSITIONS_A_RANGE = 500_000
-"""Number of transitions above which another range of cells, and thread, is worth it."""
 
 
 def padded(V: Floats) -> Floats:

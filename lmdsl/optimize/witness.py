@@ -30,12 +30,12 @@ from lmdsl.optimize.policies import evaluation, iteration
 
 MOST_GUESSED = 1e-7  # relative slack above which a lower bound is not made by scaling V
 
+# Number of passes towards the lower bound, and of transitions read above which they end.
 LEAST_PASSES, MOST_PASSES, MOST_READ = 100, 2000, 2 * 10**8
-"""Number of passes towards the lower bound, and of transitions read above which they end."""
 
+# Near gamma_bar rounding of large values exceeds an absolute slack. The value at gamma (1 + s)
+# leaves a slack s gamma P V relative to V above; the optimum at gamma (1 - s) below.
 RELATIVE_SLACK = (1e-13, 1e-11, 1e-9)
-"""Near gamma_bar rounding of large values exceeds an absolute slack. The value at
-gamma (1 + s) leaves a slack s gamma P V relative to V above; the optimum at gamma (1 - s) below."""
 
 
 def certify(

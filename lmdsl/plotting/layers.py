@@ -17,13 +17,14 @@ from lmdsl.errors import BadInput, MissingDependency, shown
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.plotting.view import View, number, rectangles
 
+# Colours are logarithmic from so many decades on, and span no more than so many.
 DECADES, DEEPEST = 2, 8
-"""Colours are logarithmic from so many decades on, and span no more than so many."""
 
 INK, FAINT, HATCH = "#222222", "#999999", "#8c8c8c"
 ATTRACTOR = "#ff2fa0"
 CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
 UNSOLVED, INFINITE = 7, int(CellStatus.BEYOND_GAMMA)
+# Region: name, colour, hatch; greys are cells that cannot be stabilized, by cause.
 REGIONS: dict[int, tuple[str, str, str | None]] = {
     UNSOLVED: ("stabilizable", "#dcebf7", None),
     INFINITE: ("no finite cost", "#fde0c2", None),
@@ -33,10 +34,9 @@ REGIONS: dict[int, tuple[str, str, str | None]] = {
     CellStatus.AVOID: ("avoid", "#4d4d4d", None),
     CellStatus.ATTRACTOR: ("attractor", ATTRACTOR, None),
 }
-"""Region: name, colour, hatch; greys are cells that cannot be stabilized, by cause."""
 
+# Number of runs of cells above which a region is drawn as an image, without hatch.
 MOST_RUNS = 5_000
-"""Number of runs of cells above which a region is drawn as an image, without hatch."""
 
 
 def blank(columns: float = 1, rows: float = 1) -> Any:

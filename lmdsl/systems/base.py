@@ -155,8 +155,8 @@ class OdeSystem(System):
         return _RungeKutta(field, tuple(states), self.step, self.substeps)
 
 
+# Number of operations, or of subformulas times substeps, above which a step is not written out.
 MOST_WRITTEN = 1_000
-"""Number of operations, or of subformulas times substeps, above which a step is not written out."""
 
 
 class _RungeKutta:

@@ -50,16 +50,13 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     return int(min(peak + _grids(problem, M, S) + OVERHEAD, 1e30))
 
 
-MARGIN = 1.1
-"""A few cells do not say exactly what all are like, and allocators keep something back."""
+MARGIN = 1.1  # a few cells do not say exactly what all are like, and allocators keep something back
 
 
-OVERHEAD = 2**25
-"""Bytes of code, kernels and tables."""
+OVERHEAD = 2**25  # bytes of code, kernels and tables
 
 
-CODE = 250
-"""Bytes of a code of samples with noise: its exact numerator, of up to a thousand bits."""
+CODE = 250  # bytes of a code of samples with noise: its exact numerator, of up to a thousand bits
 
 
 def _blocks(problem: Problem, S: int) -> int:
@@ -81,20 +78,17 @@ def _grids(problem: Problem, M: int, S: int) -> int:
     return controls + points * 40 * len(problem.state_box) + nodes * discretization.NODE + codes
 
 
+# Number of additions above which compiling takes more than a moment, and heeds the deadline.
 SHORT = 2e9
-"""Number of additions above which compiling takes more than a moment, and heeds the deadline."""
 
 
-SAMPLE = 40
-"""Additions that take as long as locating and sorting a sample."""
+SAMPLE = 40  # additions that take as long as locating and sorting a sample
 
 
-CALL = 2_000
-"""Additions that take as long as NumPy's own work for an operation on an array."""
+CALL = 2_000  # additions that take as long as NumPy's own work for an operation on an array
 
 
-SET = 20_000
-"""Additions that take as long as resolving a point or a box of a set, its cells apart."""
+SET = 20_000  # additions that take as long as resolving a point or a box of a set, its cells apart
 
 
 def unless_short(problem: Problem, deadline: Deadline) -> Deadline:

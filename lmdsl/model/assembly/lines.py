@@ -19,11 +19,10 @@ from lmdsl.formulas.program import Instruction, Program
 from lmdsl.model.assembly.tape import Inputs, Located, Tape, run
 from lmdsl.model.grid.axis import AxisCells
 
-LINE = 512
-"""Number of samples at a time: a dozen lines of them fit into the first-level cache."""
+LINE = 512  # number of samples at a time: a dozen lines of them fit into the first-level cache
 
+# Number of instructions below which NumPy is as fast, and above which lines leave the cache.
 LEAST, MOST = 8, 1_000
-"""Number of instructions below which NumPy is as fast, and above which lines leave the cache."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,14 +25,12 @@ from lmdsl.problem.problem import Problem
 from lmdsl.systems.base import StateMap
 from lmdsl.systems.function import Audit, FunctionMap
 
+# Number of samples at a time: few enough to stay in cache, many enough to keep threads apart.
 CHUNK = 2**17
-"""Number of samples at a time: few enough to stay in cache, many enough to keep threads apart."""
 
-LEAST_LINE = 64
-"""Number of pairs side by side from which on arithmetic goes line by line."""
+LEAST_LINE = 64  # number of pairs side by side from which on arithmetic goes line by line
 
-FEW = 16
-"""Number of cells, and of controls, above which a function is asked twice of so many only."""
+FEW = 16  # number of cells, and of controls, above which a function is asked twice of so many only
 
 
 class Block(NamedTuple):

@@ -40,8 +40,7 @@ class Transitions:
     cost: Floats  # weighted mean of the stage cost over the samples of each pair
 
 
-SORTED_ALONE = CHUNK // 2
-"""Number of samples of a pair from which on they are sorted by themselves."""
+SORTED_ALONE = CHUNK // 2  # number of samples of a pair from which on they are sorted by themselves
 
 
 def assemble(

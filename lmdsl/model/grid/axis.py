@@ -14,11 +14,10 @@ import numpy as np
 from lmdsl.common.types import Floats
 from lmdsl.machine.kernels import fixed, kernel
 
-EDGE = 1e-9
-"""Width of an edge in cells: points this close to an edge count as lying on it."""
+EDGE = 1e-9  # width of an edge in cells: points this close to an edge count as lying on it
 
+# Number of turns away from a circle above which an image counts as out: rounding decides it.
 MOST_TURNS = 2.0**20
-"""Number of turns away from a circle above which an image counts as out: rounding decides it."""
 
 ROUNDING = 2.0**-53  # relative error of a rounded operation
 

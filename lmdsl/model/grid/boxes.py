@@ -47,8 +47,7 @@ class Region(Frozen):
         return {"box": {name: list(ends) for name, ends in self.box.items()}, "cells": self.cells}
 
 
-MOST_REGIONS = 8
-"""Number of boxes above which a set of cells is named in part."""
+MOST_REGIONS = 8  # number of boxes above which a set of cells is named in part
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,14 +18,12 @@ from numpy.typing import NDArray
 from lmdsl.common.types import Indices
 from lmdsl.machine.forking import cached_property
 
+# Number of axes besides the first above which only the last ones are visited in both directions.
+# More directions take more memory, and each sweep longer: cells are read less in a row.
 MOST_FLIPPED = 2
-"""Number of axes besides the first above which only the last ones are visited in both directions.
 
-More directions take more memory, and each sweep longer: cells are read less in a row.
-"""
-
+# Share of the cells, one in so many, above which they are picked from the orders of all cells.
 FEW = 4
-"""Share of the cells, one in so many, above which they are picked from the orders of all cells."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,14 +13,14 @@ import numpy as np
 from lmdsl.common.types import Floats
 
 STEPS, DOUBLINGS = 200, 64  # number of Newton steps, and of doublings, above which it fails
+# Relative change of the gain that ends the work, and below which it only has to stop falling: near
+# a mode that hardly decays Newton halves it.
 ENOUGH, ROUNDING, FALLING = 1e-13, 1e-6, 0.9
-"""Relative change of the gain that ends the work, and below which it only has to stop falling: near
-a mode that hardly decays Newton halves it."""
 RESIDUAL = 1e-8  # residual relative to the solution above which it is refused
+# Modulus of a mode under feedback above which rounding in 1 - K leaves no digits of it.
 STABLE = 1 - 1e-11
-"""Modulus of a mode under feedback above which rounding in 1 - K leaves no digits of it."""
+# Least power of two that a weight may have beside the largest: smaller ones are as good as it.
 LEAST = -1000.0
-"""Least power of two that a weight may have beside the largest: smaller ones are as good as it."""
 
 
 class Unstabilizable(Exception):

@@ -18,12 +18,11 @@ from lmdsl.optimize.policies import bellman
 from lmdsl.optimize.policies.evaluation import peeled, stability_vector
 from lmdsl.optimize.policies.iteration import iterate
 
+# Number of sweeps after which a proof is given up unless they moved it much less than the ones
+# before, and of rounds of them.
 SWEEPS, MOST_ROUNDS = 30, 8
-"""Number of sweeps after which a proof is given up unless they moved it much less than the ones
-before, and of rounds of them."""
 
-NEAR = 64
-"""Largest level above which a few passes from the levels hardly make a stabilizing policy."""
+NEAR = 64  # largest level above which a few passes from the levels hardly make a stabilizing policy
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,11 +14,11 @@ from lmdsl.optimize.feasibility import spectral_radius, stopping
 from lmdsl.optimize.feasibility.spectral_radius import PolicyClasses
 from lmdsl.optimize.policies import evaluation, iteration
 
+# Relative width of the bracket aimed at, and the least that may be asked for.
 WIDTH, LEAST_WIDTH = 1e-6, 1e-8
-"""Relative width of the bracket aimed at, and the least that may be asked for."""
 
+# Number of steps of optimal stopping above which the cells that limit gamma_bar stay unnamed.
 MOST_STEPS_INSIDE = 12
-"""Number of steps of optimal stopping above which the cells that limit gamma_bar stay unnamed."""
 
 
 def check_high(lp: StabilizationLP, w: Floats) -> float | None:

@@ -11,20 +11,18 @@ from lmdsl.model.grid.directions import Directions
 from lmdsl.optimize.linear import classes, equations
 from lmdsl.optimize.linear.gauss_seidel import SplitMatrix
 
-LEAST_ENTRY = 1e-250
-"""Least entry of the vector of a class whose largest is 1."""
+LEAST_ENTRY = 1e-250  # least entry of the vector of a class whose largest is 1
 
+# How much slower than the slowest class one is known to be before its exact rate is left open.
 SLOWER = 1e-3
-"""How much slower than the slowest class one is known to be before its exact rate is left open."""
 
+# Number of steps of Noda's iteration above which it fails, and relative width that ends it.
 STEPS, FINE = 100, 1e-11
-"""Number of steps of Noda's iteration above which it fails, and relative width that ends it."""
 
+# First relative step down to a rate that may be too low; then four times as far each time.
 REACH = 1e-4
-"""First relative step down to a rate that may be too low; then four times as far each time."""
 
-SMALLEST, LARGEST = 1e-280, 1e300
-"""Range of w."""
+SMALLEST, LARGEST = 1e-280, 1e300  # range of w
 
 
 def _perron(

@@ -27,17 +27,14 @@ from lmdsl.optimize.feasibility.perron import FINE, _perron, _scale
 from lmdsl.optimize.linear import classes, equations
 from lmdsl.optimize.policies import bellman, iteration
 
-TIED = 1e-6
-"""Relative difference of rates above which two classes do not count as equally slow."""
+TIED = 1e-6  # relative difference of rates above which two classes do not count as equally slow
 
-PASSES = 8
-"""Passes over all pairs towards a policy from which runs last least."""
+PASSES = 8  # passes over all pairs towards a policy from which runs last least
 
-HORIZON = 4
-"""Number of times the least possible steps within which a policy should bring runs to A."""
+HORIZON = 4  # number of times the least possible steps within which a policy should bring runs to A
 
+# Number of improvements above which none is made; how well first rates are known; gain of none.
 ROUNDS, COARSE, SLIGHT = 100, 1e-2, 1e-10
-"""Number of improvements above which none is made; how well first rates are known; gain of none."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,13 +25,12 @@ from lmdsl.optimize.linear.substitution import Peeled
 
 TRIAL_SWEEPS = 60  # number of sweeps after which it is asked how fast they converge
 MAX_SWEEPS = 200_000  # number of sweeps above which they are given up
+# Number of components from which on Krylov steps are made; of steps, and of sweeps in them, two
+# cycles each, above which they end.
 KRYLOV, KRYLOV_STEPS, KRYLOV_SWEEPS = 1000, 200, 1600
-"""Number of components from which on Krylov steps are made; of steps, and of sweeps in them, two
-cycles each, above which they end."""
+# Number of sweeps to go above which Krylov steps, and a sparse factorisation, are tried first.
 FEW_SWEEPS, MANY_SWEEPS = 100, 300
-"""Number of sweeps to go above which Krylov steps, and a sparse factorisation, are tried first."""
-PER_CORE = 20
-"""Number of sweeps of the core for one of all cells above which all are swept again."""
+PER_CORE = 20  # number of sweeps of the core for one of all cells above which all are swept again
 
 
 def solve(

@@ -1,7 +1,7 @@
 """Where sweeps stall: extrapolation along one mode, and BiCGSTAB, a Krylov method, on sweeps.
 
-One mode, such as the slow escape from a well-mixed set, is what hinders most. The first two take a few
-Jacobi steps, after which the residual is nearly that mode, and go as far along it as every
+One mode, such as the slow escape from a well-mixed set, is what hinders most. The first two take a
+few Jacobi steps, after which the residual is nearly that mode, and go as far along it as every
 component allows: down to just above the solution of x = b + M x, or up to above it.
 """
 
@@ -15,8 +15,8 @@ from lmdsl.machine.deadline import Stopped
 from lmdsl.optimize.linear.gauss_seidel import CEILING, SplitMatrix
 
 SWEEPS, STEPS = 4, 16  # number of sweeps, and of Jacobi steps, before extrapolating
+# Relative fall below which, and number of Jacobi steps above which, rounding would decide.
 LEAST_FALL, FARTHEST = 1e-10, 1e4
-"""Relative fall below which, and number of Jacobi steps above which, rounding would decide."""
 ROUNDING = 1e-13  # relative rise up to which x counts as above b + M x
 
 

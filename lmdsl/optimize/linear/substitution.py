@@ -24,13 +24,13 @@ from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, SplitMatrix
 
 CellNumbers = NDArray[np.uint32]
 
+# Number of cells of a level from which on it is solved in threads, and number of its ranges.
 PARALLEL_FROM, PARTS = 40_000, 8
-"""Number of cells of a level from which on it is solved in threads, and number of its ranges."""
 
 WORD, BYTE = np.uint64(64), np.uint64(8)
 
+# Number of words that a level spans, for each of its cells, above which it is not sorted.
 FAR = np.uint64(8)
-"""Number of words that a level spans, for each of its cells, above which it is not sorted."""
 
 
 @dataclass(frozen=True, eq=False)

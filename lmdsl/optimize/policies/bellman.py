@@ -12,8 +12,7 @@ from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.vectors import over_cells, padded
 
-IN_PLACE = 4
-"""Number of ranges of a pass in which a cell sees the new values of its own range only."""
+IN_PLACE = 4  # number of ranges of a pass in which a cell sees the new values of its own range only
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,19 +24,17 @@ from lmdsl.optimize.linear.substitution import Peeled
 from lmdsl.optimize.policies.evaluation import evaluate, peeled, stability_vector
 from lmdsl.optimize.policies.screening import Pass, Screen
 
-TIE = 1e-12
-"""Relative difference in Q above which two controls are not tied."""
+TIE = 1e-12  # relative difference in Q above which two controls are not tied
 
 LEAST_SWEEPS, MOST_SWEEPS = 12, 60  # least and largest number of sweeps of an evaluation
 
+# Number of cells for each changed one above which another pass costs less than an evaluation.
 FEW = 500
-"""Number of cells for each changed one above which another pass costs less than an evaluation."""
 
+# Number of sweeps in unfinished evaluations above which a Krylov method takes their place.
 PATIENCE = 200
-"""Number of sweeps in unfinished evaluations above which a Krylov method takes their place."""
 
-PROBES = 64
-"""Number of rows looked at before all are."""
+PROBES = 64  # number of rows looked at before all are
 
 
 @dataclass(frozen=True, eq=False)

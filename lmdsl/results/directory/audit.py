@@ -23,11 +23,11 @@ from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.systems import FunctionSystem
 
+# Keys of certificate.json that say history, options, text; of the digest a difference is said.
 NOT_CLAIMED = (
     "backend", "solver_status", "tolerance", "polish_steps", "iterations", "gap_before_polish",
     "seconds", "versions", "message", "model_sha256",
 )  # fmt: skip
-"""Keys of certificate.json that say history, options, text; of the digest a difference is said."""
 
 _WEAKER = {"cost": 1e-9, "lower_bound": 1e-9, "gap": 1e-3, "contraction": 1e-9}
 _ROUNDING = {
