@@ -17,7 +17,7 @@ from lmdsl import backends
 from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.policy_iteration import Iterated
 from lmdsl.backends.scaled import failure
-from lmdsl.common.frozen import freeze
+from lmdsl.common.records import freeze
 from lmdsl.common.types import Floats, Pairs
 from lmdsl.errors import BadInput, MissingDependency, plain_text
 from lmdsl.machine import quiet

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.common.types import Floats, Indices
 
 if TYPE_CHECKING:

@@ -22,12 +22,7 @@ if TYPE_CHECKING:
     from lmdsl.model.lp import StabilizationLP
 
 # The factorisation of every algorithm, the default first.
-ALGORITHMS = {
-    "primal": "faer",
-    "dual": "faer",
-    "primal-qdldl": "qdldl",
-    "dual-qdldl": "qdldl",
-}
+ALGORITHMS = {"primal": "faer", "dual": "faer", "primal-qdldl": "qdldl", "dual-qdldl": "qdldl"}
 
 # The default, and the relative tolerance below which no smaller one is passed on.
 TOLERANCE, LEAST_TOLERANCE = 1e-8, 1e-12

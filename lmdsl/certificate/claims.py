@@ -19,7 +19,7 @@ A solver's status plays no part. A claim that almost holds is repaired or refuse
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from lmdsl.common.json_values import jsonable
+from lmdsl.common.records import jsonable
 from lmdsl.common.types import Floats, Pairs
 
 CLAIMS = ("stabilizing", "upper_bound", "lower_bound", "measure")

@@ -65,10 +65,6 @@ def _measure(lp: StabilizationLP, policy: Pairs, mu: Floats) -> Found:
     return Found(holds, residual)
 
 
-def _refusal(lp: StabilizationLP, policy: Pairs, w: Floats) -> Found:
-    return Found(checks.check_refusal(lp, w))
-
-
 def _not_stabilizing(lp: StabilizationLP, policy: Pairs | None, number: float | None) -> str:
     lost = 0 if policy is None else int((~reaches_attractor(lp, policy)).sum())
     if lost and lp.gamma < 1:
@@ -108,7 +104,8 @@ MEASURE = Claim(
     "measure_residual",
 )  # fmt: skip
 REFUSAL = Claim(
-    "refusal", About.NO_POLICY, "refusal", _refusal, exact_checks.refusal,
+    "refusal", About.NO_POLICY, "refusal",
+    lambda lp, _, w: Found(checks.check_refusal(lp, w)), exact_checks.refusal,
     lambda lp, *_: f"proved: no policy has finite cost at gamma = {lp.gamma!r}",
 )  # fmt: skip
 # In the order of certificate.json.

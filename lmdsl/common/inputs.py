@@ -26,6 +26,11 @@ def whole(value: Any, where: str, least: int = 1, most: float = MOST) -> int:
     return number
 
 
+def is_number(value: Any) -> bool:
+    """Return whether something is a real number; booleans are none."""
+    return isinstance(value, float | int | np.floating | np.integer) and value is not True
+
+
 def flag(value: Any, where: str) -> bool:
     """Return True or False; text, numbers and arrays are neither."""
     if not isinstance(value, bool | np.bool_):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lmdsl.common import inputs
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.surroundings import own_arithmetic

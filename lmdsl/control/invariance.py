@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common.json_values import Reported
+from lmdsl.common.records import Reported
 from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.formulas.enclosures import Jet, apply, enclosure
 from lmdsl.formulas.intervals import Interval, subtract

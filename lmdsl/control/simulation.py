@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.common.types import Floats, Indices
 from lmdsl.control.loop import CYCLING, LOST, REACHED, ClosedLoop, Held, draw_starts
 from lmdsl.errors import BadInput

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl.common import inputs
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.common.types import Progress, Statuses
 from lmdsl.errors import BadInput, shown
 from lmdsl.explanation import one_cell

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.json_values import Reported
+from lmdsl.common.records import Reported
 from lmdsl.common.types import Bools, Floats, Indices, Statuses
 from lmdsl.model.assembly.sampler import CHUNK, Sampler
 from lmdsl.model.discretization import control_values

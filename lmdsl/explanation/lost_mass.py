@@ -23,7 +23,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.errors import LmdslError, shown
 from lmdsl.explanation.one_cell import NAMES

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common.frozen import Frozen
-from lmdsl.common.json_values import jsonable
+from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Bools, Indices, Statuses
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.assembly.sampler import Block, Sampler

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common import inputs
-from lmdsl.common.frozen import Frozen, freeze
+from lmdsl.common.records import Frozen, freeze
 from lmdsl.common.types import Floats, Indices, Progress, Statuses
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline

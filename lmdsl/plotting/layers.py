@@ -132,14 +132,8 @@ def outline(ax: Any, view: View, mask: Bools, colour: str, width: float = 0.9) -
         if all((q.stop - q.start) < 0.03 * n for q, n in zip(part, mask.shape, strict=True)):
             centre = [(e[q.start] + e[q.stop]) / 2 for e, q in zip((x, y), part, strict=True)]
             for ink, size in (("white", 2.4), (ATTRACTOR, 1.3)):
-                ax.scatter(
-                    *centre,
-                    s=75,
-                    facecolors="none",
-                    edgecolors=ink,
-                    linewidths=size,
-                    zorder=3.2,
-                )
+                ring = {"facecolors": "none", "edgecolors": ink, "linewidths": size}
+                ax.scatter(*centre, s=75, zorder=3.2, **ring)
 
 
 def frames(ax: Any, view: View, boxes: Sequence[Mapping[str, tuple[float, float]]]) -> None:

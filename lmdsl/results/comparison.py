@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl.common import inputs
-from lmdsl.common.json_values import Reported
+from lmdsl.common.records import Reported
 from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, printable, shown
 from lmdsl.machine.deadline import TimeLimitReached

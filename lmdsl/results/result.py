@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from lmdsl.certificate import sums
 from lmdsl.certificate.claims import Certificate
 from lmdsl.common import inputs
-from lmdsl.common.frozen import freeze
-from lmdsl.common.json_values import Reported
+from lmdsl.common.records import Reported, freeze
 from lmdsl.common.types import Bools, Floats, Statuses
 from lmdsl.control.controller import Controller
 from lmdsl.control.loop import ClosedLoop

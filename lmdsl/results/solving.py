@@ -197,14 +197,10 @@ def _asked(
 def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:
     if not isinstance(problem, Problem | StabilizationLP):
         raise BadInput(f"{shown(problem)} is neither a Problem nor a compiled LP", "problem")
-    if not _number(tolerance) or not 0 <= tolerance < 1e300:
+    if not inputs.is_number(tolerance) or not 0 <= tolerance < 1e300:
         raise BadInput(f"{shown(tolerance)} must be a finite number >= 0", "tolerance")
     if max_iterations is not None:
         inputs.whole(max_iterations, "max_iterations", most=math.inf)
-
-
-def _number(value: Any) -> bool:
-    return isinstance(value, float | int | np.floating | np.integer) and value is not True
 
 
 def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[Cause, str] | None:

@@ -5,8 +5,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from lmdsl.common.frozen import Frozen
-from lmdsl.common.json_values import Reported, jsonable
+from lmdsl.common.records import Frozen, Reported, jsonable
 from lmdsl.common.types import Statuses
 from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.simulation import Simulation

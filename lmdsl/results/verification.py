@@ -15,7 +15,7 @@ import numpy as np
 from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.certificate.judge import CLAIMS, exact_verdict, verdict
 from lmdsl.common import inputs
-from lmdsl.common.json_values import jsonable
+from lmdsl.common.records import jsonable
 from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, printable
 from lmdsl.machine import memory

@@ -18,11 +18,7 @@ class Lorenz(NamedOde):
 
     kind: Literal["lorenz"] = "lorenz"
     defaults: ClassVar = {"sigma": 10.0, "rho": 28.0, "beta": 8 / 3}
-    formulas: ClassVar = {
-        "x": "sigma*(y - x)",
-        "y": "x*(rho + u - z) - y",
-        "z": "x*y - beta*z",
-    }
+    formulas: ClassVar = {"x": "sigma*(y - x)", "y": "x*(rho + u - z) - y", "z": "x*y - beta*z"}
     step: Positive = 0.1
     substeps: Substeps = 5
     summary = "Lorenz system: stabilize steady convection (C+) by adjusting the heating"

@@ -13,7 +13,7 @@ import pytest
 from problems import doubling, made, standard_map, steps
 
 import lmdsl as lm
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.errors import LmdslError, MissingDependency
 
 NOISE = {"w": {"values": [-0.01, 0.01], "weights": [0.5, 0.5]}}

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.common.types import Bools, Indices
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.axis import EDGE

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common import inputs
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.forking import cached_property

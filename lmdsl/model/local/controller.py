@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline

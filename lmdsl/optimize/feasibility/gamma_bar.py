@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl.common import inputs
-from lmdsl.common.frozen import Frozen
+from lmdsl.common.records import Frozen
 from lmdsl.common.types import Floats, Pairs, Progress, TimeUp, never
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, Stopped
@@ -166,8 +166,7 @@ def gamma_max(
         It was not compiled in time.
     """
     inputs.kind(problem, (Problem, StabilizationLP), "problem", "a Problem or a compiled LP")
-    number = isinstance(width, float | int | np.floating | np.integer) and width is not True
-    if not number or not LEAST_WIDTH <= width <= 1:
+    if not inputs.is_number(width) or not LEAST_WIDTH <= width <= 1:
         raise BadInput(f"{shown(width)} must be a number from {LEAST_WIDTH} to 1", "width")
     deadline = Deadline.of(time_limit)
     lp = compile(problem, progress, deadline) if isinstance(problem, Problem) else problem

@@ -21,7 +21,7 @@ from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
 from lmdsl.common import arrays
 from lmdsl.common.files import MAX_FILE_BYTES, parsed, reason
-from lmdsl.common.json_values import jsonable
+from lmdsl.common.records import jsonable
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.model.discretization import control_count, control_vectors
@@ -44,9 +44,6 @@ TYPES = {
     "cell_status": "|u1",
     "witness": "<f8",
 }
-# What a directory can hold of ours; the figures are written by ``plot``.
-FILES = (*reading.NAMES, "figures.png")
-MODEL = ("pair_pointer", "control", "pointer", "target", "code", "cost")
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> None:

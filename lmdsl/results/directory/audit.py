@@ -8,7 +8,7 @@ import numpy as np
 from lmdsl.certificate.checks import MEASURE_TOLERANCE
 from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
-from lmdsl.common.json_values import jsonable
+from lmdsl.common.records import jsonable
 from lmdsl.common.types import Floats
 from lmdsl.control.invariance import SAMPLES, LocalCheck, examine
 from lmdsl.machine.deadline import Deadline
@@ -22,12 +22,6 @@ from lmdsl.results.directory.certificate_file import SCOPE, CertificateFile
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.systems import FunctionSystem
-
-# Keys of certificate.json that say history, options, text; of the digest a difference is said.
-NOT_CLAIMED = (
-    "backend", "solver_status", "tolerance", "polish_steps", "iterations", "gap_before_polish",
-    "seconds", "versions", "message", "model_sha256",
-)  # fmt: skip
 
 _WEAKER = {"cost": 1e-9, "lower_bound": 1e-9, "gap": 1e-3, "contraction": 1e-9}
 _ROUNDING = {
