@@ -1,6 +1,6 @@
 """The wall between a backend and everything that is proved.
 
-A backend, ours or a stranger's, is asked here and nowhere else. What it returns is read once and
+A backend, ours or a third party's, is asked here and nowhere else. What it returns is read once and
 copied into plain arrays of our own, what it raises becomes a failure, and what it is given is its
 own copy of the model. Beyond this module a solution is data, right or wrong.
 """
@@ -18,7 +18,7 @@ from lmdsl.backends import Backend, Options, Solution, Stop
 from lmdsl.backends.policy_iteration import Iterated
 from lmdsl.backends.scaled import failure
 from lmdsl.common.records import freeze
-from lmdsl.common.types import Floats, Pairs
+from lmdsl.common.types import Floats, Indices, Policy
 from lmdsl.errors import BadInput, MissingDependency, plain_text
 from lmdsl.machine import quiet
 from lmdsl.machine.deadline import Deadline
@@ -79,7 +79,7 @@ def _ask(
 
 
 def _copies(lp: StabilizationLP, options: Options) -> tuple[StabilizationLP, Options]:
-    """Return copies: what a stranger does to them, then or later, happens to nobody else."""
+    """Return copies: what a backend does to them, then or later, happens to nobody else."""
     function = getattr(lp.problem.system, "next", None)  # of Python: the user's, not to be copied
     own = copy.deepcopy(lp, {id(function): function} if callable(function) else {})
     start, proof = copy.copy(options.start), copy.copy(options.proof)
@@ -87,7 +87,7 @@ def _copies(lp: StabilizationLP, options: Options) -> tuple[StabilizationLP, Opt
     return own, replace(options, start=start, proof=proof)
 
 
-def _without_suboptimal(lp: StabilizationLP, options: Options) -> tuple[Pairs, Options]:
+def _without_suboptimal(lp: StabilizationLP, options: Options) -> tuple[Indices, Options]:
     """Return the columns worth solving for, and the options for a model of these alone."""
     deadline, start = Deadline(options.time_limit), options.start
     assert start is not None
@@ -112,7 +112,7 @@ def _plain(lp: StabilizationLP, found: Any) -> Solution:
     )
 
 
-def _over(lp: StabilizationLP, solution: Solution, kept: Pairs | None) -> Solution:
+def _over(lp: StabilizationLP, solution: Solution, kept: Indices | None) -> Solution:
     """Return a solution over all columns, where only some were asked for."""
     if kept is None:
         return solution
@@ -142,7 +142,7 @@ def _numbers(values: Any, count: int) -> Floats | None:
     return array if np.isfinite(array).all() else None
 
 
-def _columns(lp: StabilizationLP, policy: Any) -> Pairs | None:
+def _columns(lp: StabilizationLP, policy: Any) -> Policy | None:
     array = _own(policy, lp.n, "iu")
     if array is None:
         return None

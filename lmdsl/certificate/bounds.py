@@ -14,7 +14,7 @@ import numpy as np
 
 from lmdsl.certificate.sums import LEAST as LEAST
 from lmdsl.certificate.sums import UNIT as UNIT
-from lmdsl.common.types import Floats, Pairs
+from lmdsl.common.types import Floats, Indices, Policy
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.vectors import over_cells, padded
@@ -30,7 +30,7 @@ MAX_EXACT = 20_000
 NO_BOUNDS, NO_PAIRS = np.empty(0), np.empty(0, dtype=np.int64)
 
 
-def expected_above(lp: StabilizationLP, policy: Pairs, x: Floats, gamma: float) -> Floats:
+def expected_above(lp: StabilizationLP, policy: Policy, x: Floats, gamma: float) -> Floats:
     """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
     upper, V = np.empty(lp.n), padded(x)
     above = _above if never_underflows(lp, x, gamma) else _carefully_above
@@ -39,7 +39,7 @@ def expected_above(lp: StabilizationLP, policy: Pairs, x: Floats, gamma: float) 
 
 
 def inflow(
-    lp: StabilizationLP, policy: Pairs, mu: Floats, gamma: float
+    lp: StabilizationLP, policy: Policy, mu: Floats, gamma: float
 ) -> tuple[Floats, Floats, Floats]:
     """Return gamma P_u'mu as summed in doubles, and its rounding error: relative and absolute.
 
@@ -52,7 +52,7 @@ def inflow(
     return total[:-1], terms * UNIT, absolute
 
 
-def decrease(lp: StabilizationLP, policy: Pairs, w: Floats, g: float) -> Floats | None:
+def decrease(lp: StabilizationLP, policy: Policy, w: Floats, g: float) -> Floats | None:
     """Return d > 0 with w >= g P_u w + d, rounded down; None where w > 0 has no such d.
 
     It proves that the spectral radius of g P_u is at most 1 - min d/w < 1.
@@ -78,12 +78,12 @@ def holds_for_all(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | N
     return all(exactly_below(lp, int(k), x, gamma, cost) for k in open_pairs)
 
 
-def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Pairs | None:
+def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Indices | None:
     """Return the pairs for which x <= gamma P_a x + G_a is not clear; None if too many."""
     V = padded(x)
     cost, plain = np.empty(0) if cost is None else cost, never_underflows(lp, x, gamma)
 
-    def part(first: int, last: int) -> tuple[int, Pairs]:
+    def part(first: int, last: int) -> tuple[int, Indices]:
         found = np.empty(MAX_EXACT, dtype=np.int64)
         given = (first, last, *lp._kernel, gamma, cost, V)
         count, _, _ = _open(*given, found) if plain else _carefully(*given, NO_BOUNDS, found)

@@ -7,7 +7,7 @@ import numpy as np
 
 from lmdsl.certificate import bounds, exact_sums, sums
 from lmdsl.certificate.sums import rounded_up, total_above
-from lmdsl.common.types import Floats, Pairs
+from lmdsl.common.types import Floats, Policy
 from lmdsl.model.lp import StabilizationLP
 
 MEASURE_TOLERANCE = 1e-9  # residual of mu relative to its size above which it is refused
@@ -16,7 +16,7 @@ MEASURE_TOLERANCE = 1e-9  # residual of mu relative to its size above which it i
 MOST_EXACT = 200_000
 
 
-def check_stabilizing(lp: StabilizationLP, policy: Pairs, w: Floats) -> float | None:
+def check_stabilizing(lp: StabilizationLP, policy: Policy, w: Floats) -> float | None:
     """Claim 1: return a proved bound on rho(g P_u), None where the claim does not hold.
 
     It is 1 - min d/w < 1 rounded up, which may be 1.
@@ -34,7 +34,7 @@ def check_stabilizing(lp: StabilizationLP, policy: Pairs, w: Floats) -> float | 
     return None if found is None or found >= 1 else rounded_up(found)
 
 
-def check_upper(lp: StabilizationLP, policy: Pairs, V_up: Floats) -> bool:
+def check_upper(lp: StabilizationLP, policy: Policy, V_up: Floats) -> bool:
     """Claim 2: V_up >= gamma P_u V_up + G_u and V_up >= 0."""
     if not is_sound(lp, V_up):
         return False
@@ -52,7 +52,7 @@ def check_lower(lp: StabilizationLP, W: Floats) -> bool:
     return bounds.holds_for_all(lp, W, lp.gamma, lp.cost)
 
 
-def check_measure(lp: StabilizationLP, policy: Pairs, mu: Floats) -> tuple[float, bool]:
+def check_measure(lp: StabilizationLP, policy: Policy, mu: Floats) -> tuple[float, bool]:
     """Claim 4: return ||m - mu + gamma P_u'mu||_1 rounded up, and whether the claim holds.
 
     The residual is infinite where mu is not >= 0. Where rounding alone decides, or a number
@@ -94,7 +94,7 @@ def is_sound(lp: StabilizationLP, x: Floats) -> bool:
 
 
 def _extreme(
-    lp: StabilizationLP, policy: Pairs, x: Floats, gamma: float, cost: Floats | None
+    lp: StabilizationLP, policy: Policy, x: Floats, gamma: float, cost: Floats | None
 ) -> list[Fraction] | None:
     """Return a vector as fractions where the fast check may fail because numbers are extreme.
 
@@ -106,7 +106,7 @@ def _extreme(
     return exact_sums.fractions(x)
 
 
-def _rows(lp: StabilizationLP, policy: Pairs) -> list[exact_sums.Row]:
+def _rows(lp: StabilizationLP, policy: Policy) -> list[exact_sums.Row]:
     return [row for _, row in exact_sums.rows(lp, policy)]
 
 
@@ -115,7 +115,7 @@ def weighted(lp: StabilizationLP, values: Floats) -> float:
     return sums.total(lp.weight * values)
 
 
-def is_policy(lp: StabilizationLP, policy: Pairs) -> bool:
+def is_policy(lp: StabilizationLP, policy: Policy) -> bool:
     """Return whether an array names one column of every cell's own."""
     if policy.shape != (lp.n,) or not lp.n:
         return False

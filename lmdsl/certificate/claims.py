@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from lmdsl.common.records import jsonable
-from lmdsl.common.types import Floats, Pairs
+from lmdsl.common.types import Floats, Policy
 
 CLAIMS = ("stabilizing", "upper_bound", "lower_bound", "measure")
 
@@ -91,7 +91,7 @@ class Witness:
         Vector of the refusal; None where nothing is refused.
     """
 
-    policy: Pairs | None
+    policy: Policy | None
     w: Floats | None = None
     V_up: Floats | None = None
     W: Floats | None = None

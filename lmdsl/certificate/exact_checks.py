@@ -12,7 +12,7 @@ from lmdsl.certificate import exact_sums
 from lmdsl.certificate.checks import allowed_residual
 from lmdsl.certificate.claims import NOTHING, Found
 from lmdsl.certificate.sums import LARGEST, rounded_down, rounded_up
-from lmdsl.common.types import Guard, Pairs
+from lmdsl.common.types import Guard, Policy
 from lmdsl.model.lp import StabilizationLP
 
 Fractions = list[Fraction]
@@ -23,7 +23,7 @@ class ExactModel:
     """A model with the rows of a policy read once; ``guard`` is called now and then."""
 
     lp: StabilizationLP
-    policy: Pairs
+    policy: Policy
     rows: list[exact_sums.Row]
     guard: Guard | None
 

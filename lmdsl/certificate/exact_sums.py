@@ -9,7 +9,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Guard, Indices, Pairs
+from lmdsl.common.types import Floats, Guard, Indices, Policy
 from lmdsl.model.lp import StabilizationLP
 
 Row = list[tuple[int, int]]
@@ -69,7 +69,7 @@ def contraction(lp: StabilizationLP, rows: list[Row], w: list[Fraction]) -> Frac
     return Fraction(lp.growth) * worst / lp.rows.shares.total
 
 
-def above_policy(lp: StabilizationLP, rows: list[Row], policy: Pairs, V: list[Fraction]) -> bool:
+def above_policy(lp: StabilizationLP, rows: list[Row], policy: Policy, V: list[Fraction]) -> bool:
     """Decide V >= gamma P_u V + G_u."""
     a, shift = integers(V)
     scale, total = Fraction(lp.gamma), lp.rows.shares.total

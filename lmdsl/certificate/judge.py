@@ -10,7 +10,7 @@ import numpy as np
 
 from lmdsl.certificate import checks, exact_checks, exact_sums, sums
 from lmdsl.certificate.claims import NOTHING, Certificate, Found, Witness
-from lmdsl.common.types import Floats, Guard, Pairs
+from lmdsl.common.types import Floats, Guard, Policy
 from lmdsl.machine import threads
 from lmdsl.model.algorithm_1 import reaches_attractor
 from lmdsl.model.lp import StabilizationLP
@@ -35,37 +35,37 @@ class Claim:
     vector: str  # the field of the witness that proves it
     # check, check_exactly: whether a vector proves it, and its number: with bounds of rounding, and
     # in rationals
-    check: Callable[[StabilizationLP, Pairs, Floats], Found]
+    check: Callable[[StabilizationLP, Policy, Floats], Found]
     check_exactly: exact_checks.ExactCheck
     # the reason it gives in a certificate: where it does not hold; a refusal, where it does
-    sentence: Callable[[StabilizationLP, Pairs | None, float | None], str]
+    sentence: Callable[[StabilizationLP, Policy | None, float | None], str]
     number: str | None = None  # the field of the certificate for its number
 
 
-def _stabilizing(lp: StabilizationLP, policy: Pairs, w: Floats) -> Found:
+def _stabilizing(lp: StabilizationLP, policy: Policy, w: Floats) -> Found:
     contraction = checks.check_stabilizing(lp, policy, w)
     return Found(contraction is not None, contraction)
 
 
-def _upper_bound(lp: StabilizationLP, policy: Pairs, V_up: Floats) -> Found:
+def _upper_bound(lp: StabilizationLP, policy: Policy, V_up: Floats) -> Found:
     if not checks.check_upper(lp, policy, V_up):
         return NOTHING
     cost = sums.weighted(lp.weight, V_up, math.inf)
     return Found(True, cost) if cost < math.inf else NOTHING
 
 
-def _lower_bound(lp: StabilizationLP, policy: Pairs, W: Floats) -> Found:
+def _lower_bound(lp: StabilizationLP, policy: Policy, W: Floats) -> Found:
     if not checks.check_lower(lp, W):
         return NOTHING
     return Found(True, sums.weighted(lp.weight, W, -math.inf))
 
 
-def _measure(lp: StabilizationLP, policy: Pairs, mu: Floats) -> Found:
+def _measure(lp: StabilizationLP, policy: Policy, mu: Floats) -> Found:
     residual, holds = checks.check_measure(lp, policy, mu)
     return Found(holds, residual)
 
 
-def _not_stabilizing(lp: StabilizationLP, policy: Pairs | None, number: float | None) -> str:
+def _not_stabilizing(lp: StabilizationLP, policy: Policy | None, number: float | None) -> str:
     lost = 0 if policy is None else int((~reaches_attractor(lp, policy)).sum())
     if lost and lp.gamma < 1:
         return (
@@ -77,7 +77,7 @@ def _not_stabilizing(lp: StabilizationLP, policy: Pairs | None, number: float | 
     return "no contraction of the policy could be proved: the numbers do not allow it"
 
 
-def _no_measure(lp: StabilizationLP, policy: Pairs | None, residual: float | None) -> str:
+def _no_measure(lp: StabilizationLP, policy: Policy | None, residual: float | None) -> str:
     text = "the Lyapunov measure could not be established"
     if residual is None:
         return text
@@ -167,12 +167,12 @@ def exact_verdict(
     return _certificate(lp, policy, found, gap, tolerance)
 
 
-def _policy(lp: StabilizationLP, witness: Witness) -> Pairs | None:
+def _policy(lp: StabilizationLP, witness: Witness) -> Policy | None:
     policy = witness.policy
     return policy if policy is not None and checks.is_policy(lp, policy) else None
 
 
-def _asked(policy: Pairs | None) -> list[Claim]:
+def _asked(policy: Policy | None) -> list[Claim]:
     other = About.NO_POLICY if policy is not None else About.POLICY
     return [claim for claim in CLAIMS if claim.about is not other]
 
@@ -183,7 +183,7 @@ def _holds(found: Mapping[str, Found], claim: Claim) -> bool:
 
 def _certificate(
     lp: StabilizationLP,
-    policy: Pairs | None,
+    policy: Policy | None,
     found: Mapping[str, Found],
     gap: float | None,
     tolerance: float,

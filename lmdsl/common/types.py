@@ -9,7 +9,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]  # whole numbers, such as cells, positions or columns
 Statuses = NDArray[np.uint8]  # codes of ``CellStatus``, by cell
-Pairs = NDArray[np.int64]  # a policy: a column per position of C, shape (n,); or any columns
+Policy = NDArray[np.int64]  # a column per position of C, shape (n,)
 
 TimeUp = Callable[[], bool]  # asked now and then by what takes long: True ends the work early
 # Told what is being done, and which part of it, 0 to 1, is done.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Indices, Pairs
+from lmdsl.common.types import Bools, Indices, Policy
 from lmdsl.machine import memory, threads
 from lmdsl.machine.kernels import ONE, fixed, kernel
 from lmdsl.model.rows import Rows
@@ -186,7 +186,7 @@ def _search(pointer, before, cell, alive, start, level, pair):  # type: ignore[n
                     pair[i] = k
 
 
-def reaches_attractor(lp: StabilizationLP, policy: Pairs) -> Bools:
+def reaches_attractor(lp: StabilizationLP, policy: Policy) -> Bools:
     """Return the cells from which the policy can reach A, shape (n,)."""
     reaches = np.zeros(lp.n + 1, dtype=np.bool_)
     reaches[-1] = True

@@ -19,7 +19,7 @@ from lmdsl.certificate.checks import (
 )
 from lmdsl.certificate.claims import Verified, Witness
 from lmdsl.certificate.judge import PARALLEL_FROM, verdict
-from lmdsl.common.types import Floats, Pairs, TimeUp, never
+from lmdsl.common.types import Floats, Policy, TimeUp, never
 from lmdsl.machine import threads
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
@@ -40,7 +40,7 @@ RELATIVE_SLACK = (1e-13, 1e-11, 1e-9)
 
 def certify(
     lp: StabilizationLP,
-    policy: Pairs,
+    policy: Policy,
     tolerance: float,
     value: Floats | None = None,
     time_up: TimeUp = never,
@@ -62,7 +62,7 @@ def certify(
 
 
 def _first_try(
-    lp: StabilizationLP, policy: Pairs, tolerance: float, value: Floats | None, time_up: TimeUp
+    lp: StabilizationLP, policy: Policy, tolerance: float, value: Floats | None, time_up: TimeUp
 ) -> tuple[Witness, Floats | None]:
     """Return vectors that serve as a rule, and the policy's value."""
     under, own = lp.under(policy), np.arange(lp.n)
@@ -114,14 +114,14 @@ def _tightened(
 
 
 def _upper_with_slack(
-    lp: StabilizationLP, policy: Pairs, slack: float, time_up: TimeUp
+    lp: StabilizationLP, policy: Policy, slack: float, time_up: TimeUp
 ) -> Floats | None:
     V = evaluation.evaluate(lp, policy, lp.gamma * (1 + slack), time_up=time_up)
     return V if V is not None and check_upper(lp, policy, V) else None
 
 
 def _lower_with_slack(
-    lp: StabilizationLP, policy: Pairs, V: Floats, slack: float, time_up: TimeUp
+    lp: StabilizationLP, policy: Policy, V: Floats, slack: float, time_up: TimeUp
 ) -> Floats | None:
     gamma = lp.gamma * (1 - slack)
     value = evaluation.evaluate(lp, policy, gamma, start=V, time_up=time_up)
@@ -141,7 +141,7 @@ def _greater(lp: StabilizationLP, a: Floats, b: Floats | None) -> Floats:
 
 
 def upper_vector(
-    lp: StabilizationLP, policy: Pairs, V: Floats, w: Floats | None, d: Floats | None
+    lp: StabilizationLP, policy: Policy, V: Floats, w: Floats | None, d: Floats | None
 ) -> Floats | None:
     """Return V_up = V + delta w with delta >= max(residual / d), None where it fails."""
     if not np.isfinite(V).all() or not (V >= 0).all():

@@ -6,7 +6,7 @@ import numpy as np
 
 from lmdsl.backends import Solution
 from lmdsl.certificate import checks
-from lmdsl.common.types import Floats, Pairs
+from lmdsl.common.types import Floats, Policy
 from lmdsl.machine.deadline import Deadline, Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.policies import bellman, evaluation, ties
@@ -18,13 +18,13 @@ from lmdsl.optimize.witness import certify
 class _Outcome:
     """A policy after polishing, and what polishing did."""
 
-    policy: Pairs
+    policy: Policy
     value: Floats | None
     steps: int
     gap_before: float | None
 
 
-def _claimed(lp: StabilizationLP, solution: Solution) -> Pairs | None:
+def _claimed(lp: StabilizationLP, solution: Solution) -> Policy | None:
     """Return the policy of a solution: its own, else greedy in V, else largest occupation."""
     if solution.policy is not None:
         return solution.policy
@@ -41,7 +41,7 @@ def _polish(
     lp: StabilizationLP,
     solution: Solution,
     iteration: Iteration | None,
-    start: Pairs,
+    start: Policy,
     tolerance: float,
     deadline: Deadline,
 ) -> _Outcome:
@@ -95,5 +95,5 @@ def _ties_broken(
     return _Outcome(done.policy, value, steps, gap_before)
 
 
-def _usable(lp: StabilizationLP, policy: Pairs, guess: Floats | None) -> bool:
+def _usable(lp: StabilizationLP, policy: Policy, guess: Floats | None) -> bool:
     return lp.gamma < 1 or evaluation.stability_vector(lp, policy, guess)[0] is not None

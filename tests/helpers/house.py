@@ -1,4 +1,4 @@
-"""The house in numbers: rooms a level, imports between packages, lengths, files a word touches.
+"""The house in numbers: modules a level, imports between packages, lengths, files a word touches.
 
 ``python tests/helpers/house.py [FOLDER]`` prints them; ``test_design.py`` uses the same functions.
 Imports under TYPE_CHECKING do not count; those inside functions do, and are told apart.
@@ -40,18 +40,20 @@ def imports(path: Path, known: dict[str, Path]) -> Iterator[tuple[str, bool]]:
     yield from walk(ast.parse(path.read_text()), False)
 
 
-def room(name: str) -> str:
+def package_of(name: str) -> str:
     """Return the package at the top level that a module is in."""
     return name.split(".")[0]
 
 
 def edges(package: Path) -> dict[tuple[str, str], list[tuple[str, str, bool]]]:
-    """Return the imports between top-level rooms: who, whom, and whether inside a function."""
+    """Return the imports between top-level packages: who, whom, and whether inside a function."""
     known, found = modules(package), {}
     for name, path in known.items():
         for other, inside in imports(path, known) if name else ():
-            if other and room(other) != room(name):
-                found.setdefault((room(name), room(other)), []).append((name, other, inside))
+            if other and package_of(other) != package_of(name):
+                found.setdefault((package_of(name), package_of(other)), []).append(
+                    (name, other, inside)
+                )
     return found
 
 
@@ -77,7 +79,7 @@ def report(root: Path) -> dict[str, object]:
     """Return the numbers of a checkout."""
     package = root / "lmdsl"
     known = modules(package)
-    tops = {room(name) for name in known if name}
+    tops = {package_of(name) for name in known if name}
     between = edges(package)
     apart = {
         a: {b for c, b in between if c == a and not all(i for *_, i in between[a, b])} for a in tops
@@ -104,7 +106,7 @@ def report(root: Path) -> dict[str, object]:
     return {
         "modules a level": levels,
         "longest chain of modules": chain(inner) and len(chain(inner)),
-        "longest chain of rooms": chain(apart),
+        "longest chain of packages": chain(apart),
         "longest file": max(lengths.items(), key=lambda x: x[1]),
         "longest function": max(functions.items(), key=lambda x: x[1]),
         "lines of code": sum(lengths.values()),

@@ -18,7 +18,7 @@ import lmdsl as lm
 PACKAGE = Path(lm.__file__).parent
 
 # Data flows one way: a package imports only from packages before it, inside functions too.
-ROOMS = [
+PACKAGES = [
     "errors", "machine", "common", "formulas", "systems", "problem", "model", "certificate",
     "optimize", "backends", "control", "results", "explanation", "plotting", "testing", "cli",
     "__main__",
@@ -36,17 +36,17 @@ PUBLIC = [
 ]  # fmt: skip
 
 
-def test_the_rooms_are_those_of_the_plan():
-    assert {house.room(name) for name in house.modules(PACKAGE) if name} == set(ROOMS)
+def test_the_packages_are_those_of_the_plan():
+    assert {house.package_of(name) for name in house.modules(PACKAGE) if name} == set(PACKAGES)
 
 
 def test_imports_run_one_way():
-    for (room, other), found in house.edges(PACKAGE).items():
+    for (package, other), found in house.edges(PACKAGE).items():
         for name, imported, inside in found:
             if (name, imported) in FORWARDING:
                 assert inside, f"{name} imports {imported}: inside a function, please"
                 continue
-            assert ROOMS.index(other) < ROOMS.index(room), f"{name} imports {imported}"
+            assert PACKAGES.index(other) < PACKAGES.index(package), f"{name} imports {imported}"
 
 
 def test_every_forwarding_import_is_used():
@@ -61,31 +61,31 @@ def test_no_modules_import_each_other_in_a_circle():
         name: {other for other, inside in house.imports(path, known) if other and not inside}
         for name, path in known.items()
     }
-    for name in graph:  # a package's own names may come from its rooms
+    for name in graph:  # a package's own names may come from its modules
         graph[name].discard(name)
     assert house.chain(graph) is not None
 
 
 def test_the_judge_knows_nothing_of_the_judged():
     """Importing all of the certificate loads no package behind it, indirectly neither."""
-    rooms = [f"lmdsl.certificate.{path.stem}" for path in (PACKAGE / "certificate").glob("*.py")]
+    modules = [f"lmdsl.certificate.{path.stem}" for path in (PACKAGE / "certificate").glob("*.py")]
     code = (
-        f"import sys, {', '.join(r for r in rooms if '__init__' not in r)}; print([*sys.modules])"
+        f"import sys, {', '.join(r for r in modules if '__init__' not in r)}; print([*sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    for room in ROOMS[ROOMS.index("certificate") + 1 :]:
-        assert f"'lmdsl.{room}" not in done.stdout, room
+    for package in PACKAGES[PACKAGES.index("certificate") + 1 :]:
+        assert f"'lmdsl.{package}" not in done.stdout, package
 
 
-def test_no_room_takes_the_name_of_a_function():
+def test_no_module_takes_the_name_of_a_function():
     """Importing a module of that name would replace the function in its package."""
     for name, path in house.modules(PACKAGE).items():
         if path.name != "__init__.py":
             continue
         package = importlib.import_module(f"lmdsl.{name}".removesuffix("."))
-        rooms = {entry.stem for entry in path.parent.iterdir() if entry.suffix in (".py", "")}
-        for room in rooms - {"__init__", "__main__"}:
-            assert not callable(vars(package).get(room)), f"{name}.{room}"
+        modules = {entry.stem for entry in path.parent.iterdir() if entry.suffix in (".py", "")}
+        for module in modules - {"__init__", "__main__"}:
+            assert not callable(vars(package).get(module)), f"{name}.{module}"
     assert not {"check", "suggest", "study", "from_data", "from_matrices"} & {
         path.stem for path in PACKAGE.iterdir()
     }
@@ -108,10 +108,10 @@ def test_a_class_name_stands_for_one_class():
 def test_the_plan_lists_every_package_with_its_sentence():
     plan = (PACKAGE.parent / "docs/design.md").read_text()
     table = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", plan, re.MULTILINE))
-    assert [name for name in table if name in ROOMS] == ROOMS[:-1]
-    for room in ROOMS[:-1]:
-        text = inspect.getdoc(importlib.import_module(f"lmdsl.{room}")) or ""
-        assert " ".join(text.split("\n\n")[0].split()) == table[room], room
+    assert [name for name in table if name in PACKAGES] == PACKAGES[:-1]
+    for package in PACKAGES[:-1]:
+        text = inspect.getdoc(importlib.import_module(f"lmdsl.{package}")) or ""
+        assert " ".join(text.split("\n\n")[0].split()) == table[package], package
 
 
 def test_levels_are_small():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Floats, Pairs, TimeUp, never
+from lmdsl.common.types import Floats, Policy, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility import spectral_radius
@@ -29,7 +29,7 @@ NEAR = 64  # largest level above which a few passes from the levels hardly make 
 class Feasible:
     """A g-stabilizing policy, and a proof of it: w > 0 with w > g P_u w."""
 
-    policy: Pairs
+    policy: Policy
     w: Floats
 
 
@@ -52,11 +52,11 @@ class Undecided:
     ``policy`` is a policy that is stabilizing at ``lower`` < gamma.
     """
 
-    policy: Pairs
+    policy: Policy
     lower: float
 
 
-def _proved(lp: StabilizationLP, policy: Pairs, w: Floats, time_up: TimeUp) -> Floats | None:
+def _proved(lp: StabilizationLP, policy: Policy, w: Floats, time_up: TimeUp) -> Floats | None:
     """Make of a guess a proof that a policy is g-stabilizing; None where it takes too long.
 
     Where its own value is soon known and every cost positive, it is the proof; else the guess is
@@ -165,7 +165,7 @@ def _swept(lp: StabilizationLP, time_up: TimeUp) -> Feasible | None:
 
 
 def _raised(
-    lp: StabilizationLP, policy: Pairs, at: float, time_up: TimeUp
+    lp: StabilizationLP, policy: Policy, at: float, time_up: TimeUp
 ) -> tuple[float, Floats | None]:
     """Raise gamma as far towards g as a policy allows; return it, and a proof if it was raised.
 

@@ -11,8 +11,8 @@ successors in A or in lower levels": then a policy reaches A within a fixed numb
 
 The limit of one policy is found class by class (``spectral_radius``). Then *optimal stopping* at a
 gamma slightly beyond that limit decides whether the policy is as good as any. Its greatest solution
-w is the upper vector, supported where growth wins and zero elsewhere (plain power iteration would
-not close the bracket for reducible structures); or w = 0, and the policy it ends with is
+w is the upper vector, supported where it keeps growing, zero elsewhere (plain power iteration
+would not close the bracket for reducible structures); or w = 0, and the policy it ends with is
 stabilizing at that gamma: a better policy, from which to go on. Policy iteration under unit cost
 just below the limit takes most steps at once, and halving the bracket bounds their number.
 """
@@ -27,7 +27,7 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
-from lmdsl.common.types import Floats, Pairs, Progress, TimeUp, never
+from lmdsl.common.types import Floats, Policy, Progress, TimeUp, never
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, Stopped
 from lmdsl.machine.surroundings import own_arithmetic
@@ -82,7 +82,7 @@ class GammaBar(Frozen):
 
     low: float
     high: float
-    policy: Pairs
+    policy: Policy
     w_low: Floats | None
     w_high: Floats | None
     note: str = ""
@@ -184,8 +184,8 @@ def bracket(
 ) -> GammaBar:
     """Enclose gamma_bar of a compiled model, from a policy; ``time_up`` ends the work early."""
     if not lp.n:
-        nobody = np.empty(0, dtype=np.int64)
-        return GammaBar(0.0, 0.0, nobody, None, None, "no cell is stabilizable")
+        none = np.empty(0, dtype=np.int64)
+        return GammaBar(0.0, 0.0, none, None, None, "no cell is stabilizable")
     certain = exhausted_by_levels(lp)
     if certain is not None:
         return GammaBar(math.inf, math.inf, certain, None, None, stabilizable=lp.n)
@@ -216,7 +216,7 @@ def enclosed(lp: StabilizationLP, low: float, high: float) -> tuple[float, float
 class _Search:
     """The bracket while it narrows: both ends, their vectors, and the best policy so far."""
 
-    def __init__(self, lp: StabilizationLP, time_up: TimeUp, policy: Pairs, width: float) -> None:
+    def __init__(self, lp: StabilizationLP, time_up: TimeUp, policy: Policy, width: float) -> None:
         self.lp, self.time_up, self.policy, self.width = lp, time_up, policy, width
         self.steps = (0.1 * width, 0.4 * width, *(x for x in FARTHER if x > width))
         self.low, self.high = 0.0, math.inf

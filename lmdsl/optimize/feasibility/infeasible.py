@@ -5,7 +5,7 @@ from contextlib import suppress
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Bools, Floats, Pairs, TimeUp
+from lmdsl.common.types import Bools, Floats, Policy, TimeUp
 from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.lp import StabilizationLP
@@ -32,7 +32,7 @@ def check_high(lp: StabilizationLP, w: Floats) -> float | None:
     return float((w[on] / ahead[on]).max()) * (1 + 4 * bounds.UNIT)
 
 
-def exhausted_by_levels(lp: StabilizationLP) -> Pairs | None:
+def exhausted_by_levels(lp: StabilizationLP) -> Policy | None:
     """Return a policy that reaches A within n steps surely, None where there is none."""
     before = lp._predecessors
     policy = np.full(lp.n, -1, dtype=np.int64)

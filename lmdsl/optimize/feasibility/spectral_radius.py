@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Bools, Floats, Indices, Pairs, TimeUp, never
+from lmdsl.common.types import Bools, Floats, Indices, Policy, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.forking import cached_property
 from lmdsl.model.lp import StabilizationLP
@@ -41,7 +41,7 @@ ROUNDS, COARSE, SLIGHT = 100, 1e-2, 1e-10
 class PolicyClasses:
     """A policy class by class."""
 
-    policy: Pairs  # A column per cell
+    policy: Policy  # A column per cell
     P: Any  # its rows, CSR, shape (n, n)
     # order, ends: its cells by class, every class after all it leads to: see ``linear.classes``
     order: Indices
@@ -71,7 +71,7 @@ class PolicyClasses:
 
 def of_policy(
     lp: StabilizationLP,
-    policy: Pairs,
+    policy: Policy,
     time_up: TimeUp = never,
     start: Floats | None = None,
     enough: float = FINE,
@@ -112,7 +112,7 @@ def short_lived(lp: StabilizationLP, time_up: TimeUp = never) -> PolicyClasses:
     level, policy = lp._algorithm_1
     horizon = float(HORIZON * level.max())
 
-    def candidates() -> Iterator[tuple[Pairs, Floats | None]]:
+    def candidates() -> Iterator[tuple[Policy, Floats | None]]:
         w, zero = level.astype(np.float64), np.zeros(lp.K)
         for _ in range(PASSES):
             done = bellman.improve(lp, w, 1.0, zero)
@@ -161,7 +161,7 @@ def lifted(found: PolicyClasses) -> Floats | None:
     return w
 
 
-def check_low(lp: StabilizationLP, policy: Pairs, w: Floats) -> float | None:
+def check_low(lp: StabilizationLP, policy: Policy, w: Floats) -> float | None:
     """Return the largest low (rounded down) with low P_u w <= w, None where w > 0 fails."""
     if not (np.isfinite(w).all() and (w > 0).all()):
         return None

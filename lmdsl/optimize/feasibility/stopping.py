@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmdsl.common.types import Bools, Floats, Pairs, TimeUp, never
+from lmdsl.common.types import Bools, Floats, Policy, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.linear import equations
@@ -18,7 +18,7 @@ class Stopping:
     """The outcome of optimal stopping."""
 
     w: Floats  # the greatest solution of w = min(reward, gamma min_a P_a w), shape (n,)
-    policy: Pairs  # A column for every cell; it counts where ``going``
+    policy: Policy  # A column for every cell; it counts where ``going``
     going: Bools  # cells that do not stop
     converged: bool  # false where rounding or the limit ended the work
 
@@ -37,7 +37,7 @@ def optimal_stopping(
     lp: StabilizationLP,
     gamma: float,
     reward: Floats,
-    policy: Pairs | None = None,
+    policy: Policy | None = None,
     going: Bools | None = None,
     time_up: TimeUp = never,
     limit: int = 1000,
@@ -61,7 +61,7 @@ def _stopping(
     lp: StabilizationLP,
     gamma: float,
     reward: Floats,
-    policy: Pairs,
+    policy: Policy,
     going: Bools,
     time_up: TimeUp,
     limit: int,
@@ -98,7 +98,7 @@ def _stopped(
     lp: StabilizationLP,
     gamma: float,
     reward: Floats,
-    policy: Pairs,
+    policy: Policy,
     going: Bools,
     before: Floats,
     time_up: TimeUp,

@@ -5,7 +5,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Indices, Pairs
+from lmdsl.common.types import Indices, Policy
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.lp import StabilizationLP
@@ -109,7 +109,7 @@ def copy_row(r, k, slots):  # type: ignore[no-untyped-def]
     end[r] = used
 
 
-def of_policy(lp: StabilizationLP, policy: Pairs, gamma: float) -> SplitMatrix:
+def of_policy(lp: StabilizationLP, policy: Policy, gamma: float) -> SplitMatrix:
     """Return gamma P_u for a policy, ready for sweeps."""
     rows = lp.rows
     capacity = rows.pointer[policy + 1] - rows.pointer[policy]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmdsl.common.types import Bools, Floats, Pairs
+from lmdsl.common.types import Bools, Floats, Policy
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.vectors import over_cells, padded
@@ -20,7 +20,7 @@ class Improvement:
     """The result of one pass."""
 
     value: Floats  # (T V)_i, shape (n,)
-    policy: Pairs  # the first minimising column of every cell, shape (n,)
+    policy: Policy  # the first minimising column of every cell, shape (n,)
 
 
 def improve(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Floats, Pairs, never
+from lmdsl.common.types import Floats, Policy, never
 from lmdsl.common.types import TimeUp as TimeUp
 from lmdsl.model.algorithm_1 import reaches_attractor
 from lmdsl.model.lp import StabilizationLP
@@ -14,7 +14,7 @@ from lmdsl.optimize.linear.substitution import Peeled
 
 def evaluate(
     lp: StabilizationLP,
-    policy: Pairs,
+    policy: Policy,
     gamma: float | None = None,
     cost: Floats | None = None,
     start: Floats | None = None,
@@ -40,14 +40,14 @@ def evaluate(
     return x if found else None
 
 
-def peeled(lp: StabilizationLP, policy: Pairs, gamma: float) -> Peeled:
+def peeled(lp: StabilizationLP, policy: Policy, gamma: float) -> Peeled:
     """Return gamma P_u, ready for :func:`evaluate`."""
     return Peeled.of(of_policy(lp, policy, gamma))
 
 
 def stability_vector(
     lp: StabilizationLP,
-    policy: Pairs,
+    policy: Policy,
     guess: Floats | None = None,
     g: float | None = None,
     sharp: bool = False,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmdsl.certificate import bounds
-from lmdsl.common.types import Floats, Pairs, never
+from lmdsl.common.types import Floats, Policy, never
 from lmdsl.common.types import TimeUp as TimeUp
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
@@ -42,7 +42,7 @@ class Iteration:
     """The outcome of policy iteration."""
 
     # policy, value: the last policy and its value
-    policy: Pairs
+    policy: Policy
     value: Floats
     steps: int  # improvement steps that changed the policy
     converged: bool  # false when stopped early
@@ -51,7 +51,7 @@ class Iteration:
 
 def iterate(
     lp: StabilizationLP,
-    policy: Pairs,
+    policy: Policy,
     value: Floats,
     gamma: float | None = None,
     cost: Floats | None = None,
@@ -152,7 +152,7 @@ class _Sweeps:
 
 
 def _to_the_end(
-    screen: Screen, policy: Pairs, V: Floats, rows: Peeled | None, time_up: TimeUp
+    screen: Screen, policy: Policy, V: Floats, rows: Peeled | None, time_up: TimeUp
 ) -> Floats | None:
     """Return the value of a policy with V >= T_u V, None where none is found."""
     lp, gamma, cost = screen.lp, screen.gamma, screen.cost
@@ -167,7 +167,7 @@ def _fall(before: Floats, after: Floats) -> float:
     return 1.0 - float(ratio.min(initial=1.0))
 
 
-def bound(lp: StabilizationLP, policy: Pairs, w: Floats | None = None) -> Floats | None:
+def bound(lp: StabilizationLP, policy: Policy, w: Floats | None = None) -> Floats | None:
     """Return V >= T_u V of a g-stabilizing policy, close to its value; None where none is found.
 
     With w >= g P_u w + d, c w serves as soon as c d >= G_u; sweeps then lower it. Where all rows
@@ -188,7 +188,7 @@ def bound(lp: StabilizationLP, policy: Pairs, w: Floats | None = None) -> Floats
     return np.minimum(x, V)
 
 
-def _even(lp: StabilizationLP, policy: Pairs, gamma: float, cost: Floats) -> Floats | None:
+def _even(lp: StabilizationLP, policy: Policy, gamma: float, cost: Floats) -> Floats | None:
     """Return a constant V >= T_u V within a percent of the policy's value, None where none is."""
     some = np.arange(0, lp.n, lp.n // PROBES + 1)  # few have to be looked at where none is
     rows = lp.rows.take(policy[some])

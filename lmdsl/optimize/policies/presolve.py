@@ -8,7 +8,7 @@ the same optimum. What it answers is certified over all pairs all the same.
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Pairs, TimeUp, never
+from lmdsl.common.types import Floats, Indices, Policy, TimeUp, never
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.policies import bellman, iteration
 
@@ -18,8 +18,8 @@ MARGIN = 1e-9  # relative excess over V above which a column is eliminated
 
 
 def survivors(
-    lp: StabilizationLP, policy: Pairs, w: Floats | None = None, time_up: TimeUp = never
-) -> Pairs:
+    lp: StabilizationLP, policy: Policy, w: Floats | None = None, time_up: TimeUp = never
+) -> Indices:
     """Return the columns that may belong to an optimal policy, and those of a first one, ascending.
 
     ``policy`` is gamma-stabilizing, w a proof of it where known; ``time_up`` ends the work with

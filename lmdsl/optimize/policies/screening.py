@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Floats, Pairs
+from lmdsl.common.types import Bools, Floats, Policy
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model import vectors
@@ -33,7 +33,7 @@ class Pass:
     """The outcome of one pass."""
 
     value: Floats  # min(V, T V) where a control changed, min(V, T_u V) elsewhere, shape (n,)
-    policy: Pairs  # the policy after the pass, shape (n,)
+    policy: Policy  # the policy after the pass, shape (n,)
     changed: int  # number of cells whose control changed
     looked: int  # number of rows read
 
@@ -59,7 +59,7 @@ class Tied(NamedTuple):
     """The tied columns, the first of each cell, and space for the Q of a cell's pairs."""
 
     ties: Bools
-    first: Pairs
+    first: Policy
     q: Floats
 
 
@@ -90,7 +90,7 @@ class Screen:
         self.policy_cost = np.full(lp.n, np.nan)
         self.scale = 1.0
         self.passes = 0
-        self.policy: Pairs | None = None  # whose rivals
+        self.policy: Policy | None = None  # whose rivals
 
     @cached_property
     def slots(self) -> Slots:
@@ -98,11 +98,11 @@ class Screen:
         lp = self.lp
         return Slots.of(lp.rows, lp.pair_pointer, self.gamma, lp._directions)
 
-    def improve(self, V: Floats, policy: Pairs, margin: float) -> Pass:
+    def improve(self, V: Floats, policy: Policy, margin: float) -> Pass:
         """Change a control where another one is better: Q < Q_u - margin |Q_u|.
 
         Cells are visited forwards and backwards by turns, each with the new values of those before
-        it in the same range of cells, so that news travels far in a pass. V >= T_u V, shape (n,);
+        it in the same range of cells, so that changes spread far in a pass. V >= T_u V, shape (n,);
         so a policy other than that of the last pass is looked at wherever it differs, as one of its
         rivals.
         """
@@ -124,7 +124,7 @@ class Screen:
         self.policy = new
         return Pass(value, new, *(int(sum(each)) for each in zip(*counts, strict=True)))
 
-    def tied(self, V: Floats, tolerance: float, policy: Pairs) -> tuple[Bools, Pairs, bool]:
+    def tied(self, V: Floats, tolerance: float, policy: Policy) -> tuple[Bools, Policy, bool]:
         """Find the columns with Q <= Q_min + tolerance |Q_min| at V, and those of a policy.
 
         V is optimal to a relative 1e-9, and of the policy. Returns the ties, shape (K,), the

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lmdsl.common.types import Bools, Floats, Indices, Pairs, never
+from lmdsl.common.types import Bools, Floats, Indices, Policy, never
 from lmdsl.common.types import TimeUp as TimeUp
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Stopped
@@ -18,11 +18,11 @@ from lmdsl.optimize.policies.screening import Screen
 
 def canonical(
     lp: StabilizationLP,
-    policy: Pairs,
+    policy: Policy,
     value: Floats,
     screen: Screen | None = None,
     time_up: TimeUp = never,
-) -> Pairs:
+) -> Policy:
     """Break ties so that an optimal policy reaches A: the policy that every backend ends with.
 
     Tied are the columns with Q <= Q_min + 1e-12 |Q_min|. Among them take those optimal for unit
@@ -69,7 +69,7 @@ def canonical(
     return chosen
 
 
-def _renumbered(columns: Indices, policy: Pairs, sub: StabilizationLP) -> Pairs:
+def _renumbered(columns: Indices, policy: Policy, sub: StabilizationLP) -> Policy:
     """Return a policy in the columns of a part; where it has none, that of Algorithm 1."""
     place = np.minimum(np.searchsorted(columns, policy), len(columns) - 1)
     owned = columns[place] == policy
@@ -83,7 +83,7 @@ def _taken_by_ties(lp: StabilizationLP, count: int) -> int:
     return count * (30 + copied)
 
 
-def first_column(lp: StabilizationLP, allowed: Bools) -> Pairs:
+def first_column(lp: StabilizationLP, allowed: Bools) -> Policy:
     """Return the first allowed column of every cell (each cell must have one)."""
     columns = np.flatnonzero(allowed)
     return columns[np.searchsorted(columns, lp.pair_pointer[:-1])]

@@ -28,6 +28,8 @@ _ROUNDING = {
     "cost": (1e-12, 0.0), "lower_bound": (1e-12, 0.0), "gap": (0.0, 1e-15),
     "contraction": (0.0, 1e-15),
 }  # fmt: skip
+"""By how much, relative, a stored number may be weaker than the one proved anew; by how much,
+relative and absolute, stronger."""
 _BRACKET = 2e-8  # relative excess over the bracket proved anew above which it is refused
 
 
