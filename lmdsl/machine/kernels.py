@@ -4,8 +4,9 @@ A kernel is compiled when it is first called with arguments of some types. The r
 file, so that this happens once on a machine: in ``NUMBA_CACHE_DIR`` where that is set, else beside
 this module, or where that cannot be written in the user's folder for caches. Where there is none,
 kernels are compiled anew in every process; this is said once. Unlike Numba's own cache, this one
-notices a change in a kernel that another calls and a changed constant, needs no index, and holds a
-checksum: what cannot be read, or is not what was written, is compiled again.
+notices a change in a kernel that another calls, in a constant and in the fields of a named tuple,
+needs no index, and holds a checksum: what cannot be read, or is not what was written, is compiled
+again.
 """
 
 import gc

@@ -137,7 +137,6 @@ class _Job:
         self, witness: Witness, proof: Certificate, status: Status, message: str, **more: Any
     ) -> Result:
         lp = self.lp
-
         w = witness.w if witness.refusal is None else witness.refusal
         index = np.full(lp.partition.size, -1, dtype=np.int32)
         if witness.policy is not None:

@@ -76,10 +76,11 @@ class Peeled:
 
     def substitute(self, b: Floats, x: Floats) -> bool:
         """Solve x = b + M x outside the core in place; False where there is no finite solution."""
+        system = self.system.kernel
 
         def part(span: tuple[int, int]) -> bool:
             cells = self.order[span[0] : span[1]]
-            return bool(_back(cells, self.system.kernel, b, x))
+            return bool(_back(cells, system, b, x))
 
         for first, last, large in reversed(self._spans):
             if large:
