@@ -107,7 +107,7 @@ def iterate(
             return ended(not out)
         else:
             try:
-                exact = _to_the_end(screen, policy, V, rows, time_up)
+                exact = _to_the_end(screen, policy, done.value, rows, time_up)
             except Stopped:
                 return ended(False)
             if exact is None:
