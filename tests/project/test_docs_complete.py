@@ -91,19 +91,8 @@ def test_outputs_are_described():
     directory = section(text, "## The result directory")
     stored = archive._certificate(result)
     assert not missing(set(stored) - set(result.to_dict()), directory)
-    assert not missing(
-        {
-            *stored["claims"],
-            *archive.TYPES,
-            "pair_pointer",
-            "control",
-            "pointer",
-            "target",
-            "code",
-            "cost",
-        },
-        directory,
-    )
+    arrays = {*archive.TYPES, *archive._model_arrays(result.lp)}
+    assert not missing({*stored["claims"], *arrays}, directory)
     assert not missing([*reading.NAMES, "figures.png"], directory)
     runs = result.simulate(starts=5)
     assert not missing({*runs.to_dict(), *runs.steps}, section(text, "## `lmdsl simulate`"))
