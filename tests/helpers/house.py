@@ -12,7 +12,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-
 WORDS = {"a claim": "lower_bound", "a problem key": "on_exit", "an output format": "drn"}
 
 
