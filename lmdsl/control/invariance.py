@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl.common.records import Reported
-from lmdsl.common.types import Bools, Floats, Guard, Indices
+from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.formulas.enclosures import Jet, apply, enclosure
 from lmdsl.formulas.intervals import Interval, subtract
 from lmdsl.formulas.program import FUNCTION
@@ -86,14 +86,12 @@ def examine(
     The deadline ends the work with what is known; ``samples`` are as many random states as take
     some seconds where their number is not given.
     """
-    cells = np.flatnonzero(local.attractor)
-    asked, nodes = Deadline.of(deadline), noise_nodes(problem).values
-    true_map = TrueMap(problem, local.partition)
+    cells, loop = np.flatnonzero(local.attractor), _Loop(problem, local, Deadline.of(deadline))
     if samples is None:
-        work = FUNCTION if true_map.map.enclose is None else true_map.map.work
-        samples = int(min(SAMPLES, max(SAMPLED_WORK // (work * len(nodes)), FEWEST)))
-    proved = _proved(true_map, local, cells, nodes, asked)
-    samples, kept = _sampled(true_map, local, cells, nodes, samples, asked)
+        work = FUNCTION if loop.true_map.map.enclose is None else loop.true_map.map.work
+        samples = int(min(SAMPLES, max(SAMPLED_WORK // (work * len(loop.nodes)), FEWEST)))
+    proved = _proved(loop, cells)
+    samples, kept = _sampled(loop, cells, samples)
     return LocalCheck(
         kind="constant" if problem.local_controller is None else problem.local_controller.kind,
         multiplier=local.multiplier,
@@ -104,67 +102,60 @@ def examine(
     )
 
 
-def _sampled(
-    true_map: TrueMap,
-    local: LocalController,
-    cells: Indices,
-    nodes: Floats,
-    count: int,
-    deadline: Deadline,
-) -> tuple[int, int]:
+class _Loop:
+    """The true map under the local controller, all noise nodes, and what ends the work in time."""
+
+    def __init__(self, problem: Problem, local: LocalController, deadline: Deadline) -> None:
+        self.local, self.partition = local, local.partition
+        self.true_map, self.nodes = TrueMap(problem, local.partition), noise_nodes(problem).values
+        self.guard = partial(deadline.raise_if_over, DOING)
+
+
+def _sampled(loop: _Loop, cells: Indices, count: int) -> tuple[int, int]:
     """Return how many states were tried in time, and how many of them stay."""
     rng = np.random.default_rng(0)
     cell = cells[rng.integers(len(cells), size=count)]
-    partition = local.partition
+    partition = loop.partition
     index = np.stack(partition.multi_index(cell), axis=-1)
     x = partition.low + (index + rng.random(index.shape)) * partition.width
-    kept, part = 0, max(FEWEST, CHUNK // len(nodes))
+    kept, part = 0, max(FEWEST, CHUNK // len(loop.nodes))
     for start in range(0, count, part):
         some = slice(start, min(start + part, count))
         try:
-            kept += int(_stays(true_map, local, x[some], cell[some], nodes, deadline).sum())
+            kept += int(_stays(loop, x[some], cell[some]).sum())
         except TimeLimitReached:
             return start, kept
     return count, kept
 
 
-def _stays(
-    true_map: TrueMap,
-    local: LocalController,
-    x: Floats,
-    cell: Indices,
-    nodes: Floats,
-    deadline: Deadline,
-) -> Bools:
+def _stays(loop: _Loop, x: Floats, cell: Indices) -> Bools:
     """Return which states of attractor cells are mapped into A by every noise node."""
-    u = local(x, cell)
+    u = loop.local(x, cell)
     states, controls = list(x.T[:, :, None]), list(u.T[:, :, None])
     stays = np.ones(len(x), dtype=np.bool_)
     width = max(1, CHUNK // max(len(x), 1))
-    for start in range(0, len(nodes), width):
-        some = nodes[start : start + width]
+    for start in range(0, len(loop.nodes), width):
+        some = loop.nodes[start : start + width]
         shape, noise = (len(x), len(some)), list(some.T[:, None, :])
-        images = true_map(states, controls, noise, partial(deadline.raise_if_over, DOING))
-        target = local.partition.locate([np.broadcast_to(y, shape) for y in images])
-        stays &= ((target >= 0) & local.attractor[target]).all(axis=1)
+        images = loop.true_map(states, controls, noise, loop.guard)
+        target = loop.partition.locate([np.broadcast_to(y, shape) for y in images])
+        stays &= ((target >= 0) & loop.local.attractor[target]).all(axis=1)
     return stays
 
 
-def _proved(
-    true_map: TrueMap, local: LocalController, cells: Indices, nodes: Floats, deadline: Deadline
-) -> int | None:
+def _proved(loop: _Loop, cells: Indices) -> int | None:
     """Count the cells that are mapped into A as a whole; None where no formula allows it.
 
     Cells that are still undecided when the work is used up count as not proved.
     """
-    if true_map.map.enclose is None:
+    if loop.true_map.map.enclose is None:
         return None
-    per_box = float(true_map.map.effort) * len(nodes) * (1 + local.partition.dimension)
+    per_box = float(loop.true_map.map.effort) * len(loop.nodes) * (1 + loop.partition.dimension)
     proved, work = 0, WORK
     for start in range(0, len(cells), CHUNK):
         some = cells[start : start + CHUNK]
         try:
-            kept, spent = _kept(true_map, local, some, nodes, work / per_box, deadline)
+            kept, spent = _kept(loop, some, work / per_box)
         except TimeLimitReached:
             break
         proved += kept
@@ -174,20 +165,13 @@ def _proved(
     return proved
 
 
-def _kept(
-    true_map: TrueMap,
-    local: LocalController,
-    cells: Indices,
-    nodes: Floats,
-    limit: float,
-    deadline: Deadline,
-) -> tuple[int, float]:
+def _kept(loop: _Loop, cells: Indices, limit: float) -> tuple[int, float]:
     """Return how many of some cells are proved, and the work in boxes.
 
     A box whose image is not enclosed in A is halved along its longest side (in cell widths),
     unless its centre is mapped outside: then its cell is lost.
     """
-    partition, guard = local.partition, partial(deadline.raise_if_over, DOING)
+    partition = loop.partition
     (low, high, owner), work = partition.domain(cells), 0.0
     lost = np.zeros(len(cells), dtype=np.bool_)
     for _ in range(ROUNDS * partition.dimension):
@@ -196,12 +180,12 @@ def _kept(
             break
         inside = np.ones(len(owner), dtype=np.bool_)
         with np.errstate(all="ignore"):
-            for node in nodes:
-                guard()
-                images = _images(true_map, local, cells[owner], low, high, node, guard)
-                inside &= _into(partition, local.attractor, images)
+            for node in loop.nodes:
+                loop.guard()
+                images = _images(loop, cells[owner], low, high, node)
+                inside &= _into(partition, loop.local.attractor, images)
         centre = low / 2 + high / 2
-        lost[owner[~_stays(true_map, local, centre, cells[owner], nodes, deadline)]] = True
+        lost[owner[~_stays(loop, centre, cells[owner])]] = True
         open_ = ~inside & ~lost[owner]
         low, high, owner = low[open_], high[open_], owner[open_]
         axis = np.argmax((high - low) / partition.width, axis=1)
@@ -214,41 +198,26 @@ def _kept(
     return int((~lost).sum()), work
 
 
-def _images(
-    true_map: TrueMap,
-    local: LocalController,
-    cell: Indices,
-    low: Floats,
-    high: Floats,
-    noise: Floats,
-    guard: Guard,
-) -> list[Interval]:
+def _images(loop: _Loop, cell: Indices, low: Floats, high: Floats, noise: Floats) -> list[Interval]:
     """Enclose T(x, C0(x), w) on boxes."""
     centre = Interval.point(low / 2 + high / 2)
     away = subtract(Interval(low, high), centre)
-    steps = [Interval(*(end[:, k] for end in away)) for k in range(local.partition.dimension)]
-    images = _closed(true_map, local, cell, Interval(low, high), noise, guard)
-    middle = _closed(true_map, local, cell, centre, noise, guard)
+    steps = [Interval(*(end[:, k] for end in away)) for k in range(loop.partition.dimension)]
+    images = _closed(loop, cell, Interval(low, high), noise)
+    middle = _closed(loop, cell, centre, noise)
     return [enclosure(image, at, steps) for image, at in zip(images, middle, strict=True)]
 
 
-def _closed(
-    true_map: TrueMap,
-    local: LocalController,
-    cell: Indices,
-    box: Interval,
-    noise: Floats,
-    guard: Guard,
-) -> tuple[Jet, ...]:
+def _closed(loop: _Loop, cell: Indices, box: Interval, noise: Floats) -> tuple[Jet, ...]:
     """Return jets of the closed loop, derivatives with respect to the states."""
-    d = local.partition.dimension
+    d = loop.partition.dimension
     x = [Jet.variable(Interval(box.low[:, i], box.high[:, i]), i, d) for i in range(d)]
 
     def on_jets(operation: str, *operands: Any) -> Any:
         return apply(operation, [y if isinstance(y, Jet) else Jet.constant(y, d) for y in operands])
 
-    u, w = local.law(x, cell, on_jets), [Jet.constant(value, d) for value in noise]
-    images = true_map.enclose(x, u, w, guard)
+    u, w = loop.local.law(x, cell, on_jets), [Jet.constant(value, d) for value in noise]
+    images = loop.true_map.enclose(x, u, w, loop.guard)
     assert images is not None
     return images
 
