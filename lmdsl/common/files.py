@@ -108,16 +108,13 @@ def open_regular(path: Path, links: bool = True) -> BinaryIO:
     return open(path, "rb", opener=opener)
 
 
-def read_json(path: Path, null: bool = False) -> Any:
-    """Read strict JSON: UTF-8, no duplicate key, NaN or infinity, bounded nesting.
-
-    Null is refused unless ``null`` is True.
-    """
-    return parsed(path, read_bytes(path), null)
+def read_json(path: Path) -> Any:
+    """Read strict JSON: UTF-8, no duplicate key, null, NaN or infinity, bounded nesting."""
+    return parsed(path, read_bytes(path))
 
 
 def parsed(path: Path, content: bytes, null: bool = False) -> Any:
-    """Parse what was read of a file, which errors name."""
+    """Parse what was read of a file, which errors name; null is refused unless ``null``."""
     try:
         return strict_json(content, null)
     except BadInput as error:

@@ -33,13 +33,9 @@ class Ended(LmdslError):
 
 
 def call(
-    function: Callable[..., T],
-    *arguments: Any,
-    deadline: Deadline,
-    doing: str,
-    entries: int = LARGE,
+    function: Callable[..., T], *args: Any, deadline: Deadline, doing: str, entries: int = LARGE
 ) -> T:
-    """Return ``function(*arguments)``, made by a child where that is worth it.
+    """Return ``function(*args)``, made by a child where that is worth it.
 
     The function is one of a module, the arguments can be pickled; what it prints goes to standard
     error. Few ``entries`` of a matrix are not worth a child unless there is a deadline.
@@ -48,7 +44,7 @@ def call(
     """
     small = deadline.left is None and entries < LARGE
     if small or not sys.executable:  # embedded in another program there is no Python to start
-        return function(*arguments)
+        return function(*args)
     code = f"import sys; sys.path[:] = {sys.path!r}; from lmdsl.machine.apart import serve; serve()"
     child = subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -63,7 +59,7 @@ def call(
         if watch is not None:
             watch.start()
         with contextlib.suppress(EOFError, OSError, pickle.UnpicklingError):
-            pickle.dump((function, arguments), child.stdin, protocol=5)
+            pickle.dump((function, args), child.stdin, protocol=5)
             child.stdin.close()
             reply = pickle.load(child.stdout)
     finally:

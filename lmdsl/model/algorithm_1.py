@@ -46,8 +46,20 @@ class Graph(NamedTuple):
     alive: Bools
 
 
+# Number of visits per entry above which predecessors are made: they cost about as much.
+PATIENCE = 8
+
+PARTS = 16  # number of ranges of cells that threads work on
+
+# Number of entries of rows from which on ranges of cells are searched in threads.
+PARALLEL_FROM = 2**20
+
+
 def tree(
-    pair_pointer: Indices, rows: Rows, allowed: Bools | None = None
+    pair_pointer: Indices,
+    rows: Rows,
+    allowed: Bools | None = None,
+    before: Predecessors | None = None,
 ) -> tuple[NDArray[np.int32], Indices]:
     """Algorithm 1, corrected: breadth-first levels from A, and the pair that put a cell there.
 
@@ -57,6 +69,8 @@ def tree(
         The pairs by cell, ordered by control, and their transitions.
     allowed
         Which pairs may be used; default all.
+    before
+        The predecessors, where they are at hand: then no sweeps are made.
 
     Returns
     -------
@@ -67,24 +81,7 @@ def tree(
         there is none. On the surviving pairs this policy is stabilizing: each cell has a positive
         chance to descend, and none can leave.
     """
-    if allowed is None:
-        allowed = np.ones(rows.count, dtype=np.bool_)
-    return _tree(pair_pointer, rows, allowed)
-
-
-# Number of visits per entry above which predecessors are made: they cost about as much.
-PATIENCE = 8
-
-PARTS = 16  # number of ranges of cells that threads work on
-
-# Number of entries of rows from which on ranges of cells are searched in threads.
-PARALLEL_FROM = 2**20
-
-
-def _tree(
-    pair_pointer: Indices, rows: Rows, alive: Bools, before: Predecessors | None = None
-) -> tuple[NDArray[np.int32], Indices]:
-    """Return levels and pairs as :func:`tree`; with predecessors at hand, by these alone."""
+    alive = np.ones(rows.count, dtype=np.bool_) if allowed is None else allowed
     cells = rows.columns
     level = np.full(cells + 1, -1, dtype=np.int32)
     level[cells] = 0

@@ -26,7 +26,7 @@ from lmdsl.common.types import Bools, Indices, Statuses
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import kernel
-from lmdsl.model.algorithm_1 import Predecessors, _tree, owner
+from lmdsl.model.algorithm_1 import Predecessors, owner, tree
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.rows import Rows
 
@@ -69,7 +69,7 @@ def stabilizable(
     choices = np.diff(pair_pointer)
     reaches = None
     while True:
-        level, pair = _tree(pair_pointer, rows, alive, before)
+        level, pair = tree(pair_pointer, rows, alive, before)
         reached = level >= 0
         if reaches is None:
             reaches = reached

@@ -21,6 +21,8 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.vectors import over_cells, padded
 from lmdsl.optimize.policies.bellman import improve
 
+MOST_LOWERED = 60  # number of sweeps over the pairs that are open, after which lowering is given up
+
 
 def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Floats:
     """Return a lower bound of min_a gamma P_a x + G_a, shape (n,); ``cost`` None means 0."""
@@ -36,12 +38,7 @@ def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | No
 
 
 def lower_until_below(
-    lp: StabilizationLP,
-    x: Floats,
-    gamma: float,
-    cost: Floats | None,
-    sweeps: int = 60,
-    time_up: TimeUp = never,
+    lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None, time_up: TimeUp = never
 ) -> Floats | None:
     """Lower x until x <= gamma P_a x + G_a holds for every pair; None where it does not settle.
 
@@ -49,7 +46,7 @@ def lower_until_below(
     right-hand side is monotone in x, so nothing that holds is broken by more than it is lowered.
     """
     x = x.copy()
-    for _ in range(sweeps):
+    for _ in range(MOST_LOWERED):
         if time_up():
             break
         open_pairs = undecided(lp, x, gamma, cost)

@@ -64,26 +64,21 @@ def constant_map(problem: Problem, partition: Partition, fine: bool = False) -> 
 
 
 def open_loop(
-    problem: Problem,
-    partition: Partition,
-    x: Floats,
-    u: Mapping[str, float],
-    steps: int,
-    fine: bool,
+    problem: Problem, p: Partition, x: Floats, u: Mapping[str, float], steps: int, fine: bool
 ) -> Floats:
     """Return states of runs at a constant control, shape (T, r, d), NaN after leaving the box.
 
     With ``fine`` a step makes PIECES states.
     """
-    image = constant_map(problem, partition, fine)
+    image = constant_map(problem, p, fine)
     length = steps * (PIECES if fine else 1) + 1
     memory.require(8 * length * x.size, "runs")
     points = np.full((length, *x.shape), np.nan)
-    points[0] = partition.states(x)
+    points[0] = p.states(x)
     active = np.arange(len(x))
     held = np.tile(list(u.values()), (len(x), 1))
     for n in range(len(points) - 1):
-        following, cell = partition.enter(image(points[n, active], held[active]))
+        following, cell = p.enter(image(points[n, active], held[active]))
         finite = np.isfinite(following).all(axis=1)
         points[n + 1, active[finite]] = following[finite]
         active = active[cell >= 0]
