@@ -24,12 +24,12 @@ from lmdsl.results.status import Cause, Status
 from lmdsl.systems import FunctionSystem
 
 _WEAKER = {"cost": 1e-9, "lower_bound": 1e-9, "gap": 1e-3, "contraction": 1e-9}
+# By how much, relative, a stored number may be weaker than the one proved anew; by how much,
+# relative and absolute, stronger.
 _ROUNDING = {
     "cost": (1e-12, 0.0), "lower_bound": (1e-12, 0.0), "gap": (0.0, 1e-15),
     "contraction": (0.0, 1e-15),
 }  # fmt: skip
-"""By how much, relative, a stored number may be weaker than the one proved anew; by how much,
-relative and absolute, stronger."""
 _BRACKET = 2e-8  # relative excess over the bracket proved anew above which it is refused
 
 
