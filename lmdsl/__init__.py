@@ -76,14 +76,12 @@ __all__ = ["__version__", *_HOME, *_PACKAGES]
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        with forking.whole:
-            value = getattr(import_module(f"lmdsl.{_HOME[name]}"), name)
-    elif name in _PACKAGES:
-        with forking.whole:
-            value = import_module(f"lmdsl.{_PACKAGES[name]}")
-    else:
+    home = _HOME.get(name) or _PACKAGES.get(name)
+    if home is None:
         raise AttributeError(f"module 'lmdsl' has no attribute {name!r}")
+    with forking.whole:
+        module = import_module(f"lmdsl.{home}")
+    value = getattr(module, name) if name in _HOME else module
     globals()[name] = value
     return value
 

@@ -72,6 +72,7 @@ class FileSchema(GenerateJsonSchema):
 
 # A bound stands directly behind its type, before any validator: only there does pydantic write it
 # as a word of JSON Schema.
+
 # A finite double; booleans, strings, NaN and infinities are refused.
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True), BeforeValidator(plain)]
 

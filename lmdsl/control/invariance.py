@@ -92,14 +92,8 @@ def examine(
         samples = int(min(SAMPLES, max(SAMPLED_WORK // (work * len(loop.nodes)), FEWEST)))
     proved = _proved(loop, cells)
     samples, kept = _sampled(loop, cells, samples)
-    return LocalCheck(
-        kind="constant" if problem.local_controller is None else problem.local_controller.kind,
-        multiplier=local.multiplier,
-        cells=len(cells),
-        proved=proved,
-        samples=samples,
-        kept=kept,
-    )
+    kind = "constant" if problem.local_controller is None else problem.local_controller.kind
+    return LocalCheck(kind, local.multiplier, len(cells), proved, samples, kept)
 
 
 class _Loop:

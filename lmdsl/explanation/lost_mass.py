@@ -23,7 +23,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from lmdsl.common.records import Frozen
+from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.errors import LmdslError, shown
 from lmdsl.explanation.one_cell import NAMES
@@ -140,17 +140,15 @@ class PhaseOne(Frozen):
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data; the cells that lose most, at most 100 of them."""
-        listed = []
-        for i in self.largest():
-            cell = int(self.cells[i])
-            listed.append(
-                {
-                    "cell": cell,
-                    "box": {k: list(v) for k, v in boxes.of_cell(self.partition, cell).items()},
-                    "mass": float(self.weight[i]),
-                    "lost": float(self.lost[i]),
-                }
-            )
+        listed = [
+            {
+                "cell": int(self.cells[i]),
+                "box": jsonable(boxes.of_cell(self.partition, int(self.cells[i]))),
+                "mass": float(self.weight[i]),
+                "lost": float(self.lost[i]),
+            }
+            for i in self.largest()
+        ]
         return {
             "total": self.total,
             "lost": float(self.lost.sum()),

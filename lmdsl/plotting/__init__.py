@@ -1,9 +1,7 @@
 """Pictures of a problem and its result; matplotlib is imported when something is drawn."""
 
-from lmdsl.plotting.closed_loop import trajectories as trajectories
-from lmdsl.plotting.page import figure as figure
-from lmdsl.plotting.plots import causes as causes
-from lmdsl.plotting.plots import control as control
-from lmdsl.plotting.plots import cost as cost
-from lmdsl.plotting.plots import measure as measure
-from lmdsl.plotting.plots import portrait as portrait
+from lmdsl.plotting.closed_loop import trajectories
+from lmdsl.plotting.page import figure
+from lmdsl.plotting.plots import causes, control, cost, measure, portrait
+
+__all__ = ["causes", "control", "cost", "figure", "measure", "portrait", "trajectories"]

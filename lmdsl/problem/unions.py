@@ -1,5 +1,7 @@
 """Unions of models: told apart by ``kind``, or by a key that only one of them has."""
 
+import functools
+import operator
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -36,9 +38,7 @@ def tag_by_key(key: str, model: type) -> Any:
 def kinds(*models: type[Declared]) -> Any:
     """Return the union of models told apart by their ``kind``."""
     tagged = [Annotated[m, Tag(f"<{m.model_fields['kind'].default}>")] for m in models]
-    union: Any = tagged[0]
-    for member in tagged[1:]:
-        union = union | member
+    union: Any = functools.reduce(operator.or_, tagged)
     names = ", ".join(str(m.model_fields["kind"].default) for m in models)
     return Annotated[
         union,

@@ -198,17 +198,10 @@ class Partition(Frozen):
     @cached_property
     def axes(self) -> tuple[AxisCells, ...]:
         """The axes in plain numbers."""
-        return tuple(
-            AxisCells(
-                float(self.low[k]),
-                float(self.high[k]),
-                float(self.width[k]),
-                float(self.cells[k]),
-                float(math.prod(self.shape[k + 1 :])),
-                bool(self.periodic[k]),
-            )
-            for k in range(self.dimension)
-        )
+        stride = [float(math.prod(self.shape[k + 1 :])) for k in range(self.dimension)]
+        columns = (x.tolist() for x in (self.low, self.high, self.width, self.cells.astype(float)))
+        axes = zip(*columns, stride, self.periodic.tolist(), strict=True)
+        return tuple(AxisCells(*axis) for axis in axes)
 
     def multi_index(self, cell: NDArray[np.integer]) -> tuple[Indices, ...]:
         """Return the index of each cell on every axis."""

@@ -227,23 +227,13 @@ def _result(
         raise BadInput("cell_status holds an unknown code", "solution.npz")
     said = dict(stored) | loaded
     known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said}
-    certificate = Certificate(
-        **{claim.name: stored.claims.get(claim.name, False) for claim in CLAIMS},
-        contraction=stored.contraction,
-        cost=stored.cost,
-        lower=stored.lower_bound,
-        gap=stored.gap,
-        measure_residual=stored.measure_residual,
-        tolerance=stored.tolerance,
-        reasons=stored.reasons,
-    )
+    proof: dict[str, Any] = {f.name: getattr(stored, f.name, None) for f in fields(Certificate)}
+    proof |= {claim.name: stored.claims.get(claim.name, False) for claim in CLAIMS}
+    certificate = Certificate(**{**proof, "lower": stored.lower_bound})
     return Result(
-        **known,
-        problem=problem,
-        partition=partition,
-        certificate=certificate,
+        **known, problem=problem, partition=partition, certificate=certificate,
         control_vectors=vectors,
-    )
+    )  # fmt: skip
 
 
 def _problem(data: Any) -> Problem:
