@@ -84,7 +84,8 @@ def merge(index, cells_last, mean, numbers, key, high, wide, rows):  # type: ign
     per_cell, control, cost, end, target, code = rows
     pairs = entries = np.uint64(0)
     first, _, last = index.shape
-    down, right = np.uint64(mean.shape[0] > 1), np.uint64(mean.shape[1] > 1)
+    height, width = mean.shape
+    down, right = np.uint64(height > 1), np.uint64(width > 1)
     cells = len(per_cell)
     controls = first * last // cells
     for c0 in range(0, cells, high):
