@@ -36,7 +36,8 @@ class Move(Frozen):
         ``leaves`` the box, enters ``avoid``, is ``not finite``, or ``enters`` a cell that is not
         stabilizable.
     state, noise, image
-        The first sample that does so, and where it lands; noise is empty without noise.
+        The first sample that does so, and where it lands, or is judged on the way; noise is empty
+        without noise.
     sides
         Of ``leaves``: the sides crossed, as (axis, "low" or "high", how far beyond).
     cell, cause
@@ -169,10 +170,10 @@ def _move(sampler: Sampler, status: Statuses, cell: int, control: int) -> Move:
     if not leaving.any():
         bad = (code != CellStatus.STABILIZED) & (code != CellStatus.ATTRACTOR)
     s = int(np.argmax(bad))
-    shape = (1, len(sampler.points), len(nodes.weights), 1)
-    values = sampler.values(Block(0, np.array([cell]), (control, control + 1)))
+    block = Block(0, np.array([cell]), (control, control + 1))
+    values = sampler.values(block)
     point, node = divmod(s, len(nodes.weights))
-    image = [float(np.broadcast_to(x, shape)[0, point, node, 0]) for x in sampler.step(values)]
+    image = sampler.places(block)[:, s].tolist()
     problem = sampler.problem
     found: dict[str, Any] = {
         "control": dict(zip(problem.controls, map(float, sampler.controls[control]), strict=True)),

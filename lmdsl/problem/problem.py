@@ -6,7 +6,7 @@ file (at most 16 MiB). Geometry is resolved later, in partition.py.
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Collection
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -17,15 +17,18 @@ from lmdsl.common.strict_model import Declared, FileSchema, Positive
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.language import Formula, parse
 from lmdsl.formulas.names import FormulaText
+from lmdsl.formulas.program import Program
 from lmdsl.problem.axes import StateBox
+from lmdsl.problem.consistency import require_consistent
 from lmdsl.problem.controls import ControlGrid
-from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LocalUnion, LqrFeedback
+from lmdsl.problem.local_control import LocalUnion
 from lmdsl.problem.noise import Noise
 from lmdsl.problem.sampling import SamplingUnion
 from lmdsl.problem.sets import Attractor, Avoid, Measure
 from lmdsl.problem.unions import SystemUnion
 from lmdsl.systems import FunctionSystem, System
-from lmdsl.systems.base import StateMap
+from lmdsl.systems.base import Judged, StateMap
+from lmdsl.systems.runge_kutta import RungeKutta
 
 
 class Problem(Declared):
@@ -43,6 +46,10 @@ class Problem(Declared):
         Control variables; the control vectors are the C-order product of their values.
     stage_cost
         Formula G(x, u, w), finite and >= 0.
+    cost_rate
+        Instead, for a differential equation: a formula whose integral along the step is the cost.
+    terminal_cost
+        Formula in the states, paid on entering A.
     sampling
         Sample points within a cell for Ulam's method.
     gamma
@@ -66,7 +73,9 @@ class Problem(Declared):
     avoid: Avoid | None = None
     control_grid: ControlGrid
     noise: Noise | None = None
-    stage_cost: FormulaText
+    stage_cost: FormulaText | None = None
+    cost_rate: FormulaText | None = None
+    terminal_cost: FormulaText | None = None
     sampling: SamplingUnion
     gamma: Positive = 1.0
     on_exit: Literal["forbid", "clip"] = "forbid"
@@ -85,11 +94,10 @@ class Problem(Declared):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        self._unique_names()
-        self._axes_named()
-        self._local_named()
+        require_consistent(self)
         self.step()
         self.cost()
+        self.terminal()
         self.density()
         return self
 
@@ -104,7 +112,9 @@ class Problem(Declared):
     def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
         """Allow the key that editors need, which no problem keeps."""
         schema = super().__get_pydantic_json_schema__(core, handler)
-        handler.resolve_ref_schema(schema)["properties"]["$schema"] = {"type": "string"}
+        resolved = handler.resolve_ref_schema(schema)
+        resolved["properties"]["$schema"] = {"type": "string"}
+        resolved["oneOf"] = [{"required": [key]} for key in ("stage_cost", "cost_rate")]
         return schema
 
     @property
@@ -127,99 +137,68 @@ class Problem(Declared):
         system: System = self.system
         return system.compile(self.states, self.controls, self.noises)
 
-    def cost(self) -> Formula:
-        """Return the parsed stage cost."""
-        names = {*self.states, *self.controls, *self.noises, *self.system.constants()}
+    @property
+    def judged(self) -> Judged:
+        """Whether ``path`` or ``endpoint`` of a step is judged; a map has no path."""
+        judged: Judged = getattr(self.system, "judged", "endpoint")
+        return judged
+
+    def flow(self) -> RungeKutta | None:
+        """Return how the equation, and the cost rate, is integrated; None for a map."""
+        system: System = self.system
+        rate = None if self.cost_rate is None else self.cost()
+        return system.flow(self.states, self.controls, self.noises, rate)
+
+    def formula(
+        self, text: str, where: str, kinds: Collection[str] = ("state", "control", "noise")
+    ) -> Formula:
+        """Return a formula of this problem, parsed.
+
+        Parameters
+        ----------
+        text
+            What the user wrote.
+        where
+            The path of its field.
+        kinds
+            What may stand in it beside parameters and constants: names of states, of controls and
+            of noise variables.
+
+        Raises
+        ------
+        BadInput
+            It is no formula of these names.
+        """
+        names = {*self.system.constants()}
+        known = {"state": self.states, "control": self.controls, "noise": self.noises}
+        for kind in kinds:
+            names.update(known[kind])
         try:
-            return parse(self.stage_cost, names)
+            return parse(text, names)
         except BadInput as error:
-            raise BadInput(error.message, "stage_cost") from None
+            raise BadInput(error.message, where) from None
+
+    def cost(self) -> Formula:
+        """Return the parsed stage cost, or cost rate."""
+        if self.cost_rate is not None:
+            return self.formula(self.cost_rate, "cost_rate")
+        return self.formula(str(self.stage_cost), "stage_cost")
+
+    def stage(self) -> Program | None:
+        """Return the stage cost of named arrays; None where a cost rate stands for it."""
+        return None if self.cost_rate else Program([self.cost()], self.system.constants())
+
+    def terminal(self) -> Formula | None:
+        """Return the parsed terminal cost, None where there is none."""
+        if self.terminal_cost is None:
+            return None
+        return self.formula(self.terminal_cost, "terminal_cost", ("state",))
 
     def density(self) -> Formula | None:
         """Return the parsed density of the weight m, None where there is none."""
         if self.measure is None or self.measure.density is None:
             return None
-        try:
-            return parse(self.measure.density, {*self.states, *self.system.constants()})
-        except BadInput as error:
-            raise BadInput(error.message, "measure.density") from None
-
-    def _unique_names(self) -> None:
-        kinds = {
-            "state_box": self.states,
-            "control_grid": self.controls,
-            "noise": self.noises,
-            "system.parameters": tuple(self.system.constants()),
-        }
-        owner: dict[str, str] = {}
-        for kind, names in kinds.items():
-            for name in names:
-                if name in owner:
-                    raise BadInput(f"the name {name!r} is also used in {owner[name]}", kind)
-                owner[name] = kind
-
-    def _axes_named(self) -> None:
-        self._points_named(self.attractor.points, "attractor.points")
-        for i, cell in enumerate(self.attractor.cells):
-            if len(cell) != len(self.states):
-                raise BadInput(
-                    f"{len(cell)} indices for {len(self.states)} axes", f"attractor.cells[{i}]"
-                )
-        for where in ("attractor", "avoid", "measure"):
-            part = getattr(self, where)
-            for i, box in enumerate((part.boxes or ()) if part else ()):
-                self._box_named(box, f"{where}.boxes[{i}]")
-
-    def _points_named(self, points: Any, where: str) -> None:
-        for i, point in enumerate(points):
-            if isinstance(point, dict) and set(point) != set(self.states):
-                raise BadInput(
-                    f"a point names every axis once: {', '.join(self.states)}", f"{where}[{i}]"
-                )
-            if len(point) != len(self.states):
-                raise BadInput(
-                    f"{len(point)} coordinates for {len(self.states)} axes", f"{where}[{i}]"
-                )
-
-    def _local_named(self) -> None:
-        local, top = self.local_controller, "local_controller"
-        if local is None:
-            return
-        orbit = () if isinstance(local, ConstantControl) else local.orbit
-        self._points_named(orbit, f"{top}.orbit")
-        tables: list[tuple[str, Any, Any]] = [("control", local.control, self.controls)]
-        if isinstance(local, LqrFeedback):
-            tables.append(("state_weights", local.state_weights, self.states))
-            tables.append(("control_weights", local.control_weights, self.controls))
-        if isinstance(local, LinearFeedback):
-            tables.append(("gain", local.gain, self.controls))
-            tables += [(f"gain.{u}", row, self.states) for u, row in local.gain.items()]
-        for key, table, known in tables:
-            for name in table:
-                if name not in known:
-                    choice = f"one of {', '.join(known)}" if known else "nothing: there is none"
-                    raise BadInput(f"{shown(name)} is unknown; write {choice}", f"{top}.{key}")
-        along = {"control": local.control}
-        if isinstance(local, LinearFeedback):
-            along |= {f"gain.{u}": row for u, row in local.gain.items()}
-        for key, table in along.items():
-            for name, values in table.items():
-                if isinstance(values, tuple) and len(values) != len(orbit):
-                    raise BadInput(
-                        f"{len(values)} values for {len(orbit)} orbit points; give one each",
-                        f"{top}.{key}.{name}",
-                    )
-
-    def _box_named(self, box: Mapping[str, tuple[float, float]], where: str) -> None:
-        for name, (a, b) in box.items():
-            if name not in self.state_box:
-                raise BadInput(
-                    f"{shown(name)} is not an axis; the axes are {', '.join(self.states)}", where
-                )
-            if not a < b:
-                raise BadInput(
-                    f"[{a!r}, {b!r}] is empty; write [a, b] with a < b", f"{where}.{name}"
-                )
+        return self.formula(self.measure.density, "measure.density", ("state",))
 
     def __eq__(self, other: object) -> bool:
         """Compare all keys, and the order of axes and controls: it numbers cells and vectors."""

@@ -7,10 +7,8 @@ values.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Annotated, Any, Literal, Protocol
 
-import numpy as np
 from pydantic import BeforeValidator, Field
 
 from lmdsl.common.strict_model import Declared, Positive, plain
@@ -20,10 +18,10 @@ from lmdsl.formulas.enclosures import Jet
 from lmdsl.formulas.language import Formula, parse
 from lmdsl.formulas.names import Formulas, Parameters
 from lmdsl.formulas.program import Program
-from lmdsl.formulas.tracing import Recorder
-from lmdsl.machine.forking import cached_property
+from lmdsl.systems.runge_kutta import RungeKutta
 
 Substeps = Annotated[int, Field(strict=True, ge=1, le=1000), BeforeValidator(plain)]
+Judged = Literal["path", "endpoint"]
 
 
 def program(
@@ -101,6 +99,19 @@ class System(Declared):
         """Return the function from named arrays to the images, one array per state in order."""
         raise NotImplementedError
 
+    def flow(
+        self,
+        states: Sequence[str],
+        controls: Sequence[str],
+        noise: Sequence[str],
+        integrand: Formula | None = None,
+    ) -> RungeKutta | None:
+        """Return how the differential equation is integrated; None for a map, which has none.
+
+        With an integrand, its integral along the step is the last of what is integrated.
+        """
+        return None
+
 
 class MapSystem(System):
     """A discrete-time map: one formula per state.
@@ -133,18 +144,32 @@ class OdeSystem(System):
     step
         Sampling time: control and noise are held during it. In the units of the derivative.
     substeps
-        RK4 steps per sampling time; only the final image is judged.
+        RK4 steps per sampling time.
+    judged
+        ``path``: entering A, avoid or the outside of the box counts on the way as well.
+        ``endpoint``: only where a step ends.
     """
 
     kind: Literal["ode"] = "ode"
     derivative: Formulas
     step: Positive
     substeps: Substeps = 1
+    judged: Judged = "path"
 
     def compile(
         self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
     ) -> StateMap:
         """See :meth:`System.compile`."""
+        return self.flow(states, controls, noise)
+
+    def flow(
+        self,
+        states: Sequence[str],
+        controls: Sequence[str],
+        noise: Sequence[str],
+        integrand: Formula | None = None,
+    ) -> RungeKutta:
+        """See :meth:`System.flow`."""
         field = program(
             self.derivative,
             states,
@@ -152,72 +177,6 @@ class OdeSystem(System):
             self.parameters,
             "system.derivative",
         )
-        return _RungeKutta(field, tuple(states), self.step, self.substeps)
-
-
-# Number of operations, or of subformulas times substeps, above which a step is not written out.
-MOST_WRITTEN = 1_000
-
-
-class _RungeKutta:
-    """x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4), repeated; h = step / substeps."""
-
-    def __init__(self, field: Program, states: tuple[str, ...], step: float, substeps: int) -> None:
-        self.field, self.states = field, states
-        self.substeps, self.h = substeps, step / substeps
-        self.live = field.live + 8 * len(states)
-        self.effort, self.work = (
-            substeps * (4 * each + 14 * len(states)) for each in (field.effort, field.work)
-        )
-
-    def __call__(self, values: Mapping[str, Any], guard: Guard | None = None) -> tuple[Floats, ...]:
-        start = tuple(np.asarray(values[name], float) for name in self.states)
-        field = partial(self.field, guard=guard)
-        with np.errstate(all="ignore"):
-            images: tuple[Floats, ...] = self._advance(values, start, field)
-        return images
-
-    @cached_property
-    def formulas(self) -> tuple[Formula, ...] | None:
-        """The images written out as formulas, None where these are too long to be of use."""
-        nodes = sum(len(formula.subformulas) for formula in self.field.formulas)
-        if max(self.effort, self.substeps * nodes) > MOST_WRITTEN:
-            return None
-        recorder = Recorder()
-        start = tuple(recorder.name(name) for name in self.states)
-
-        def slope(values: Mapping[str, Any]) -> tuple[Any, ...]:
-            return recorder.replay(
-                self.field.formulas, {name: values[name] for name in self.states}
-            )
-
-        return tuple(recorder.formula(image) for image in self._advance({}, start, slope))
-
-    def enclose(self, values: Mapping[str, Jet], guard: Guard | None = None) -> tuple[Jet, ...]:
-        """Enclose the images and their derivatives on boxes."""
-        start = tuple(values[name] for name in self.states)
-        with np.errstate(all="ignore"):
-            images: tuple[Jet, ...] = self._advance(
-                values, start, partial(self.field.enclose, guard=guard)
-            )
-        return images
-
-    def _advance(self, values: Mapping[str, Any], state: tuple[Any, ...], field: Any) -> Any:
-        """Step arrays or jets: the arithmetic is the same."""
-        held, h = dict(values), self.h
-
-        def slope(at: Sequence[Any]) -> tuple[Any, ...]:
-            held.update(zip(self.states, at, strict=True))
-            image: tuple[Any, ...] = field(held)
-            return image
-
-        for _ in range(self.substeps):
-            k1 = slope(state)
-            k2 = slope([x + (h / 2) * k for x, k in zip(state, k1, strict=True)])
-            k3 = slope([x + (h / 2) * k for x, k in zip(state, k2, strict=True)])
-            k4 = slope([x + h * k for x, k in zip(state, k3, strict=True)])
-            state = tuple(
-                x + (h / 6) * (a + 2 * b + 2 * c + d)
-                for x, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
-            )
-        return state
+        if integrand is not None:
+            field = Program([*field.formulas, integrand], self.parameters)
+        return RungeKutta(field, tuple(states), self.step, self.substeps)

@@ -8,8 +8,10 @@ from pydantic import model_validator
 
 from lmdsl.common.strict_model import Positive
 from lmdsl.errors import BadInput, shown
+from lmdsl.formulas.language import Formula
 from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
-from lmdsl.systems.base import MapSystem, OdeSystem, StateMap, Substeps, System
+from lmdsl.systems.base import Judged, MapSystem, OdeSystem, StateMap, Substeps, System
+from lmdsl.systems.runge_kutta import RungeKutta
 
 
 class NamedSystem(System):
@@ -30,7 +32,8 @@ class NamedSystem(System):
     @classmethod
     def __pydantic_init_subclass__(cls, **options: Any) -> None:
         if cls.problem:
-            own = {key: field.default for key, field in cls.model_fields.items()}
+            fields = cls.model_fields.items()
+            own = {key: field.default for key, field in fields if key != "judged"}
             system = {**own, "parameters": dict(cls.defaults)}
             cls.problem = {"format": "lmdsl/1", "system": system, **cls.problem}
 
@@ -96,10 +99,13 @@ class NamedOde(NamedSystem):
         Sampling time in seconds (or in the time unit of the equations).
     substeps
         RK4 steps per sampling time.
+    judged
+        See :class:`lmdsl.systems.OdeSystem`.
     """
 
     step: Positive = 0.1
     substeps: Substeps = 1
+    judged: Judged = "path"
 
     def definition(self) -> OdeSystem:
         """See :meth:`NamedSystem.definition`."""
@@ -108,7 +114,18 @@ class NamedOde(NamedSystem):
             derivative=dict(self.formulas),
             step=self.step,
             substeps=self.substeps,
+            judged=self.judged,
         )
+
+    def flow(
+        self,
+        states: Sequence[str],
+        controls: Sequence[str],
+        noise: Sequence[str],
+        integrand: Formula | None = None,
+    ) -> RungeKutta:
+        """See :meth:`System.flow`."""
+        return self.definition().flow(states, controls, noise, integrand)
 
 
 class NotStored(BadInput):

@@ -406,6 +406,13 @@ def _attempt(rng: np.random.Generator) -> Problem:
         problem["measure"] = {"boxes": _boxes(rng, problem, 0.6)}
         if not measure_cells(problem):
             del problem["measure"]
+    if system["kind"] == "ode":
+        if rng.random() < 0.3:
+            system["judged"] = str(rng.choice(["path", "endpoint", "endpoint"]))
+        if rng.random() < 0.3:
+            problem["cost_rate"] = problem.pop("stage_cost")
+    if rng.random() < 0.2:
+        problem["terminal_cost"] = _cost(rng, list(box), [], [], point)
     try:
         gamma = _gamma(rng, problem)
     except ValueError:  # the cost is not valid: the caller draws again

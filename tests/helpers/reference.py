@@ -20,6 +20,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from reference_steps import integral, journey, knots
 from scipy.stats import qmc
 
 ATTRACTOR, STABILIZED, ESCAPES, TRAPPED, LEADS, AVOID = range(6)
@@ -289,6 +290,24 @@ def next_state_function(problem: dict[str, Any]) -> Callable[[dict[str, float]],
     """Make the function (values of every state, control, noise variable) -> image."""
     system = problem["system"]
     states = list(problem["state_box"])
+    evaluate = right_hand_side(problem)
+    if system["kind"] != "ode":
+        return evaluate
+
+    def runge_kutta(names: dict[str, float]) -> list[float]:
+        def slope(x: list[float]) -> list[float]:
+            return evaluate({**names, **dict(zip(states, x, strict=True))})
+
+        start = [float(names[s]) for s in states]
+        return knots(slope, start, system["step"], system.get("substeps", 1))[0][-1]
+
+    return runge_kutta
+
+
+def right_hand_side(problem: dict[str, Any]) -> Callable[[dict[str, float]], list[float]]:
+    """Make the function of the formulas of a map, or of the derivatives."""
+    system = problem["system"]
+    states = list(problem["state_box"])
     parameters = {k: np.float64(v) for k, v in system.get("parameters", {}).items()}
     if system["kind"] == "standard_map":
         texts = STANDARD_MAP
@@ -297,46 +316,75 @@ def next_state_function(problem: dict[str, Any]) -> Callable[[dict[str, float]],
         texts = system["next"]
     else:
         texts = system["derivative"]
-    right_hand_side = [formula(texts[s]) for s in states]
+    formulas = [formula(texts[s]) for s in states]
 
     def evaluate(names: dict[str, float]) -> list[float]:
         values = {k: np.float64(v) for k, v in names.items()}
-        return [float(f({**parameters, **values})) for f in right_hand_side]
+        return [float(f({**parameters, **values})) for f in formulas]
 
-    if system["kind"] != "ode":
-        return evaluate
+    return evaluate
 
-    substeps = system.get("substeps", 1)
-    h = system["step"] / substeps
 
-    def runge_kutta(names: dict[str, float]) -> list[float]:
-        def slope(x: list[float]) -> list[float]:
-            return evaluate({**names, **dict(zip(states, x, strict=True))})
+def step_function(
+    problem: dict[str, Any], axes: list[Axis], A: set[int], Z: set[int]
+) -> Callable[[dict[str, float]], tuple[int | str, float]]:
+    """Make the function (values of all names) -> where the sample ends, and what it costs."""
+    system, clip = problem["system"], problem.get("on_exit", "forbid") == "clip"
+    ode = system["kind"] == "ode"
+    path = ode and system.get("judged", "path") == "path"
+    image, derivative = next_state_function(problem), right_hand_side(problem)
+    rate = formula_of(problem, "cost_rate")
+    stage_cost, terminal = formula_of(problem, "stage_cost"), formula_of(problem, "terminal_cost")
+    widths, states = [a.width for a in axes], [a.name for a in axes]
 
-        def moved(x: list[float], by: float, k: list[float]) -> list[float]:
-            return [a + by * b for a, b in zip(x, k, strict=True)]
+    def where(place: list[float], final: bool) -> int | str | None:
+        cell = cell_of_image(axes, place, clip and final)
+        if cell is None:
+            return None if clip and not final else "escaped"
+        if cell in Z or cell in A:
+            return "escaped" if cell in Z else "absorbed"
+        return cell if final else None
 
-        x = [float(names[s]) for s in states]
-        for _ in range(substeps):
-            k1 = slope(x)
-            k2 = slope(moved(x, h / 2, k1))
-            k3 = slope(moved(x, h / 2, k2))
-            k4 = slope(moved(x, h, k3))
-            x = [
-                a + h / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
-                for a, b1, b2, b3, b4 in zip(x, k1, k2, k3, k4, strict=True)
+    def at_end(place: list[float], final: bool) -> int | str | None:
+        return where(place, final) if final else None
+
+    def step(names: dict[str, float]) -> tuple[int | str, float]:
+        cost = stage_cost(names) if stage_cost else 0.0
+        if not ode:
+            place = image(names)
+            key = where(place, True)
+        else:
+
+            def slope(x: list[float]) -> list[float]:
+                here = {**names, **dict(zip(states, x, strict=False))}
+                more = [rate(here)] if rate else []
+                return [*derivative(here), *more]
+
+            start = [float(names[s]) for s in states] + [0.0] * bool(rate)
+            found = knots(slope, start, system["step"], system.get("substeps", 1))
+            key, s, t, place = journey(*found[:2], widths, where if path else at_end)
+            if rate:
+                cost = integral(found[0], found[2], place, s, t)
+        if key == "absorbed" and terminal:
+            state = [
+                a.wrapped(x) if a.periodic else min(max(x, a.low), a.high) if clip else x
+                for a, x in zip(axes, place, strict=False)
             ]
-        return x
+            cost += problem.get("gamma", 1.0) * terminal(dict(zip(states, state, strict=True)))
+        return key, cost
 
-    return runge_kutta
+    return step
 
 
-def stage_cost_function(problem: dict[str, Any]) -> Callable[[dict[str, float]], float]:
+def formula_of(problem: dict[str, Any], key: str) -> Callable[[dict[str, float]], float] | None:
+    """Make the function of the values of all names that a key holds; None without the key."""
     system = problem["system"]
     parameters = {k: np.float64(v) for k, v in system.get("parameters", {}).items()}
     if system["kind"] == "standard_map":
         parameters = {"K": np.float64(0.25), **parameters}
-    value = formula(problem["stage_cost"])
+    if key not in problem:
+        return None
+    value = formula(problem[key])
 
     def evaluate(names: dict[str, float]) -> float:
         values = {k: np.float64(v) for k, v in names.items()}
@@ -404,9 +452,7 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
     A, Z = attractor_cells(problem), avoid_cells(problem)
     if not A or A & Z:
         raise ValueError("no attractor cell, or a cell that is both attractor and avoid")
-    image = next_state_function(problem)
-    stage_cost = stage_cost_function(problem)
-    clip = problem.get("on_exit", "forbid") == "clip"
+    step = step_function(problem, axes, A, Z)
     N = number_of_cells(axes)
 
     model = ReferenceModel(
@@ -436,21 +482,17 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
         for number, control in enumerate(controls):
             pair = (cell, number)
             count: dict[int | str, list[int]] = {}
+            costs = []
             for x in samples:
                 for node, (w, _) in enumerate(noise):
-                    target = cell_of_image(axes, image(_names(problem, x, control, w)), clip)
-                    if target is None or target in Z:
-                        key: int | str = "escaped"
-                    elif target in A:
-                        key = "absorbed"
-                    else:
-                        key = target
+                    key, cost = step(_names(problem, x, control, w))
                     count.setdefault(key, [0] * len(noise))[node] += 1
+                    costs.append(cost)
             model.counts[pair] = count
             model.rows[pair] = _shares(count, [w for _, w in noise], len(offsets))
             if "escaped" not in count:
                 model.admissible.add(pair)
-                model.cost[pair] = _mean_cost(model, pair, samples, stage_cost)
+                model.cost[pair] = _mean_cost(model, pair, costs)
     _classify(model)
     return model
 
@@ -475,15 +517,14 @@ def _shares(count: dict, weights: list[float], points: int) -> Row:
     return share, absorbed, escaped
 
 
-def _mean_cost(model: ReferenceModel, pair: Pair, samples: list, stage_cost: Callable) -> float:
-    terms = []
-    for x in samples:
-        for w, weight in model.noise:
-            g = stage_cost(_names(model.problem, x, model.controls[pair[1]], w))
-            if not (math.isfinite(g) and g >= 0):
-                raise ValueError(f"stage_cost is {g} at cell {pair[0]}, control {pair[1]}")
-            terms.append(weight * g)
-    return math.fsum(terms) / (model.points * math.fsum(w for _, w in model.noise))
+def _mean_cost(model: ReferenceModel, pair: Pair, costs: list[float]) -> float:
+    """Weighted mean of the costs of the samples, by sample point, then noise node."""
+    for g in costs:
+        if not (math.isfinite(g) and g >= 0):
+            raise ValueError(f"the cost is {g} at cell {pair[0]}, control {pair[1]}")
+    weights = [weight for _, weight in model.noise]
+    terms = [weight * g for weight, g in zip(weights * model.points, costs, strict=True)]
+    return math.fsum(terms) / (model.points * math.fsum(weights))
 
 
 def _can_reach(model: ReferenceModel, pairs: Iterable[Pair]) -> set[int]:

@@ -57,17 +57,23 @@ def test_random_problems(monkeypatch):
 
 @pytest.mark.parametrize("name", ["van_der_pol", "lorenz"])
 def test_polynomial_fields_are_stepped_line_by_line(name):
-    problem = lm.Problem.model_validate(dict(lm.systems.NAMED[name].problem))
+    problem = at_endpoints(lm.systems.NAMED[name].problem)
     assert compared(problem)[0]
 
 
 def test_a_model_is_the_same_either_way(monkeypatch):
-    data = dict(lm.systems.NAMED["van_der_pol"].problem)
-    problem = lm.Problem.model_validate(data)
+    problem = at_endpoints(lm.systems.NAMED["van_der_pol"].problem)
     digest = lm.compile(problem).digest
     monkeypatch.setattr(lines, "MOST", 0)
     assert not compared(problem)[0]
     assert lm.compile(problem).digest == digest
+
+
+def at_endpoints(data):
+    """The problem of a named system with steps judged where they end: only these go by lines."""
+    kind = lm.systems.NAMED[data["system"]["kind"]]
+    judged = {"judged": "endpoint"} if "judged" in kind.model_fields else {}
+    return lm.Problem.model_validate({**data, "system": {**data["system"], **judged}})
 
 
 def with_step(text, cost="2 + x*u", **more):
@@ -101,7 +107,7 @@ def test_what_is_not_correctly_rounded_is_left_to_numpy(text, monkeypatch):
 
 
 def test_short_lines_are_left_to_numpy(monkeypatch):
-    problem = lm.Problem.model_validate(dict(lm.systems.NAMED["lorenz"].problem))
+    problem = at_endpoints(lm.systems.NAMED["lorenz"].problem)
     drawn, free = sampled(problem)
     assert drawn._images is not None
     monkeypatch.setattr(lines, "run", None)  # what is not called may be missing
@@ -183,7 +189,7 @@ def test_rows_are_used_again_but_never_that_of_an_operand():
 @pytest.mark.parametrize("name", sorted(lm.systems.NAMED))
 def test_a_step_written_out_has_the_same_bits(name):
     """Runge-Kutta as one program against Runge-Kutta as it is written."""
-    problem = lm.Problem.model_validate(dict(lm.systems.NAMED[name].problem))
+    problem = at_endpoints(lm.systems.NAMED[name].problem)
     drawn, free = sampled(problem)
     values = drawn.values(next(drawn.blocks(free[:50])))
     written, step = drawn.step(values), problem.step()(values)
@@ -193,7 +199,7 @@ def test_a_step_written_out_has_the_same_bits(name):
 
 def test_long_steps_are_not_written_out():
     data = dict(lm.systems.NAMED["van_der_pol"].problem)
-    data["system"] = {**data["system"], "substeps": 1000}
+    data["system"] = {**data["system"], "substeps": 1000, "judged": "endpoint"}
     step = lm.Problem.model_validate(data).step()
     assert step.formulas is None
     assert sampled(lm.Problem.model_validate(data))[0]._images is None
@@ -210,6 +216,7 @@ def test_formulas_that_repeat_themselves_are_not_written_out():
         "derivative": {"x": long, "v": long},
         "step": 0.1,
         "substeps": 5,
+        "judged": "endpoint",
     }
     data["state_box"] = {
         name: data["state_box"][k] for name, k in zip("xv", data["state_box"], strict=True)

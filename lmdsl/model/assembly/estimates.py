@@ -7,7 +7,8 @@ from lmdsl.formulas.program import Program
 from lmdsl.machine import memory, threads
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model import discretization
-from lmdsl.model.assembly.sampler import CHUNK
+from lmdsl.model.assembly.entries import path_doubles
+from lmdsl.model.assembly.sampler import CHUNK, chunk
 from lmdsl.problem.problem import Problem
 
 
@@ -61,11 +62,11 @@ CODE = 250  # bytes of a code of samples with noise: its exact numerator, of up 
 
 def _blocks(problem: Problem, S: int) -> int:
     """Return the bytes of the blocks that are sampled at a time."""
-    step, cost = problem.step(), Program([problem.cost()], problem.system.constants())
-    d, samples, count = len(problem.state_box), max(CHUNK, S), threads.count()
-    # States, images and their cells, the arrays of a formula, keys and rows.
-    live = max(step.live, cost.live)
-    each = 8 * samples * (3 * d + live + 8)
+    step, cost = problem.step(), problem.stage()
+    d, samples, count = len(problem.state_box), max(chunk(problem), S), threads.count()
+    # States, images and their cells, paths, the arrays of a formula, keys and rows.
+    live = max(step.live, cost.live if cost else 0)
+    each = 8 * samples * (3 * d + live + 8 + path_doubles(problem))
     waiting = 8 * (count - 1) * 16 * samples  # finished blocks, for their turn
     return count * each + waiting
 
@@ -98,7 +99,8 @@ def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
     samples = discretization.sample_points(problem) * discretization.node_count(problem)
     step, cost = problem.step(), Program([problem.cost()], problem.system.constants())
     calls = 2 + 2 * lanes * min(samples, CHUNK) // CHUNK
-    work = lanes * samples * (SAMPLE + step.work + cost.work)
+    locating = SAMPLE * (1 + path_doubles(problem) // 8)
+    work = lanes * samples * (locating + step.work + cost.work)
     work += CALL * calls * (step.effort + cost.effort)
     attractor, avoid, weight = problem.attractor, problem.avoid, problem.measure
     boxes = [attractor.boxes, avoid.boxes if avoid else (), (weight and weight.boxes) or ()]

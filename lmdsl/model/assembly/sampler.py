@@ -17,9 +17,12 @@ from lmdsl.formulas.program import Program
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import fixed
 from lmdsl.model import discretization
+from lmdsl.model.assembly.entries import Entries, path_doubles
 from lmdsl.model.assembly.lines import Lines
 from lmdsl.model.assembly.merging import mean_cost
+from lmdsl.model.assembly.paths import Endings
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.sets import CellSets
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.base import StateMap
@@ -29,6 +32,7 @@ from lmdsl.systems.function import Audit, FunctionMap
 CHUNK = 2**17
 
 LEAST_LINE = 64  # number of pairs side by side from which on arithmetic goes line by line
+SHORT_PATH = 64  # number of doubles of a path above which fewer samples are done at a time
 
 FEW = 16  # number of cells, and of controls, above which a function is asked twice of so many only
 
@@ -87,6 +91,7 @@ class Sampler:
         partition: Partition,
         deadline: Deadline | None = None,
         doing: str = "compiling",
+        sets: CellSets | None = None,
     ) -> None:
         self.problem, self.partition = problem, partition
         self.points = discretization.offsets(problem)
@@ -94,20 +99,24 @@ class Sampler:
         self.nodes = discretization.noise_nodes(problem)
         self.samples = len(self.points) * len(self.nodes.weights)
         self.true_map = TrueMap(problem, partition)
-        step = _written(problem, self.true_map.map)
-        cost = Program([problem.cost()], problem.system.constants())
-        self._images, self._costs = _split(problem, step, cost)
         self.guard = guard = partial(Deadline.of(deadline).raise_if_over, doing)
-        self.step, self.cost = partial(step, guard=guard), partial(cost, guard=guard)
+        step, cost = _written(problem, self.true_map.map), problem.stage()
+        self.step = partial(step, guard=guard)
+        self.cost = None if cost is None else partial(cost, guard=guard)
+        self.chunk = chunk(problem)
+        self._entries = Entries.of(problem, partition, sets)
+        self._images, self._costs = None, None
+        if self._entries is None:
+            self._images, self._costs = _split(problem, step, cost)
         self._audit: Audit | None = None
         self._offset = np.ascontiguousarray(self.points.T)[:, :, None]
         self._control = np.ascontiguousarray(self.controls.T)
         self._noise = np.ascontiguousarray(self.nodes.values.T)[:, None, None, :, None]
 
     def blocks(self, cells: Indices) -> Iterator[Block]:
-        """Yield blocks of about CHUNK samples, ordered by cell, then control."""
+        """Yield blocks of about ``chunk`` samples, ordered by cell, then control."""
         M = len(self.controls)
-        lanes = max(1, CHUNK // self.samples)
+        lanes = max(1, self.chunk // self.samples)
         if lanes >= M:
             for i in range(0, len(cells), lanes // M):
                 yield Block(i, cells[i : i + lanes // M], (0, M))
@@ -144,12 +153,14 @@ class Sampler:
 
     def outcomes(self, block: Block) -> tuple[Floats, Floats]:
         """Return :meth:`images` and :meth:`costs` of a block."""
-        values = self.values(block)
-        first, last = block.shape
-        shape = (first, len(self.points), len(self.nodes.weights), last)
+        values, shape = self.values(block), self._shape(block)
+        if self._entries is not None:
+            ends = self._entries.ends(values, self._step, shape, self.guard)
+            cost = self._mean(sum(self._by_key(values, ends).values(), np.zeros(())))
+            return self._samples_together(ends.cell), cost
         index = mean = None
         axes, clip, weights = self.partition.axes, self.partition.clip, self.nodes.weights
-        if last >= LEAST_LINE:
+        if shape[-1] >= LEAST_LINE:
             images, costs = self._images, self._costs
             if images is not None:
                 weighting = weights if costs is images else None
@@ -160,28 +171,69 @@ class Sampler:
         return index, self.costs(block, values) if mean is None else mean
 
     def images(self, block: Block, values: Mapping[str, Floats]) -> Floats:
-        """Return the image cells, NaN where a sample leaves, shape (first, S, last)."""
-        images = self.step(values)
-        if self._audit is not None:
-            self._audit.alone(values, images)
-        index = self.partition.index(images)
-        first, last = block.shape
-        if index.size != self.samples * block.lanes:
-            shape = (first, len(self.points), len(self.nodes.weights), last)
-            index = np.ascontiguousarray(np.broadcast_to(index, shape))
-        return index.reshape(first, self.samples, last)
+        """Return the cells where samples end, NaN where one leaves, shape (first, S, last)."""
+        shape = self._shape(block)
+        if self._entries is not None:
+            index = self._entries.ends(values, self._step, shape, self.guard).cell
+        else:
+            index = self.partition.index(self._step(values))
+            if index.size != self.samples * block.lanes:
+                index = np.ascontiguousarray(np.broadcast_to(index, shape))
+        return self._samples_together(index.reshape(shape))
+
+    def places(self, block: Block) -> Floats:
+        """Return where samples end: images not wrapped, or places on the way, (d, samples)."""
+        values, shape = self.values(block), self._shape(block)
+        if self._entries is not None:
+            return self._entries.ends(values, self._step, shape, self.guard, places=True).place
+        return np.stack([np.broadcast_to(x, shape).ravel() for x in self._step(values)])
 
     def costs(self, block: Block, values: Mapping[str, Floats]) -> Floats:
         """Return the mean costs, NaN where that of a sample is negative or not finite.
 
         The shape is (first, last), with 1 for an axis on which the cost does not depend.
         """
-        cost = self.cost(values)[0]
+        return self._mean(sum(self.costs_by_key(block, values).values(), np.zeros(())))
+
+    def costs_by_key(self, block: Block, values: Mapping[str, Floats]) -> dict[str, Floats]:
+        """Return what samples cost, by key of the problem, in shapes that broadcast to theirs."""
+        if self._entries is None:
+            return self._by_key(values, None)
+        ends = self._entries.ends(values, self._step, self._shape(block), self.guard)
+        return self._by_key(values, ends)
+
+    def _by_key(self, values: Mapping[str, Floats], ends: Endings | None) -> dict[str, Floats]:
+        costs = {} if self.cost is None else {"stage_cost": np.asarray(self.cost(values)[0])}
+        if self._entries is not None and ends is not None:
+            costs |= self._entries.costs(ends, self.guard)
+        return costs
+
+    def _step(self, values: Mapping[str, Floats]) -> tuple[Floats, ...]:
+        """Return the images; of a user's function some are asked for again."""
+        images = self.step(values)
+        if self._audit is not None:
+            self._audit.alone(values, images)
+        return images
+
+    def _shape(self, block: Block) -> tuple[int, int, int, int]:
+        """Return what the arrays of a block broadcast to."""
+        first, last = block.shape
+        return first, len(self.points), len(self.nodes.weights), last
+
+    def _samples_together(self, index: Floats) -> Floats:
+        return index.reshape(index.shape[0], self.samples, index.shape[3])
+
+    def _mean(self, cost: Floats) -> Floats:
         if cost.ndim < 4:
             cost = cost.reshape((1,) * (4 - cost.ndim) + cost.shape)
         mean = np.zeros((cost.shape[0], cost.shape[3]))
         mean_cost(fixed(cost), len(self.points), self.nodes.weights, mean, mean.copy())
         return mean
+
+
+def chunk(problem: Problem) -> int:
+    """Return how many samples are evaluated at a time: fewer where each keeps a long path."""
+    return max(1, CHUNK * SHORT_PATH // max(SHORT_PATH, path_doubles(problem)))
 
 
 def _written(problem: Problem, step: StateMap) -> StateMap:
@@ -191,8 +243,12 @@ def _written(problem: Problem, step: StateMap) -> StateMap:
     return Program(step.formulas, problem.system.constants())
 
 
-def _split(problem: Problem, step: StateMap, cost: Program) -> tuple[Lines | None, Lines | None]:
+def _split(
+    problem: Problem, step: StateMap, cost: Program | None
+) -> tuple[Lines | None, Lines | None]:
     """Return how images and costs are made line by line, one and the same for both if possible."""
+    if cost is None:
+        return None, None
     if not isinstance(step, Program):
         return None, Lines.of(cost, problem.controls)
     images = Lines.of(step, problem.controls)

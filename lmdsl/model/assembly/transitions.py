@@ -58,7 +58,7 @@ def assemble(
     require_least(problem)
     deadline = unless_short(problem, Deadline.of(deadline))
     sets = CellSets.of(problem, partition, deadline)
-    sampler = Sampler(problem, partition, deadline)
+    sampler = Sampler(problem, partition, deadline, sets=sets)
     try:
         return _assembled(problem, sets, sampler, progress, deadline)
     except BaseException:
@@ -200,19 +200,20 @@ def _lengths(sampler: Sampler, sets: CellSets, block: Block) -> Indices:
 
 
 def _refuse_cost(sampler: Sampler, cell: int, control: int) -> None:
-    values = sampler.values(Block(0, np.array([cell]), (control, control + 1)))
-    sample = np.asarray(sampler.cost(values)[0])
-    faulty = sample[~((sample >= 0) & np.isfinite(sample))].ravel()
-    if not len(faulty):
-        raise BadInput("the mean of the samples overflows; scale the cost down", "stage_cost")
-    worst = float(faulty[0])
-    index = [int(k) for k in np.unravel_index(cell, sampler.partition.shape)]
-    vector = [float(u) for u in sampler.controls[control]]
-    raise BadInput(
-        f"the stage cost is {worst!r} at a sample of cell {index} under control {vector}; "
-        "it must be finite and >= 0 at every sample of every admissible pair",
-        "stage_cost",
-    )
+    block = Block(0, np.array([cell]), (control, control + 1))
+    for key, sample in sampler.costs_by_key(block, sampler.values(block)).items():
+        faulty = sample[~((sample >= 0) & np.isfinite(sample))].ravel()
+        if not len(faulty):
+            continue
+        index = [int(k) for k in np.unravel_index(cell, sampler.partition.shape)]
+        vector = [float(u) for u in sampler.controls[control]]
+        raise BadInput(
+            f"the {key.replace('_', ' ')} is {float(faulty[0])!r} at a sample of cell {index} "
+            f"under control {vector}; it must be finite and >= 0 at every sample of every "
+            "admissible pair",
+            key,
+        )
+    raise BadInput("the mean of the samples overflows; scale the cost down", "stage_cost")
 
 
 class _Growing:

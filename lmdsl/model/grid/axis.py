@@ -94,44 +94,54 @@ class AxisCells(NamedTuple):
         return np.where(at_home, 0.0, turns), x
 
 
-# The two kernels have no branch in the loop, so that they run on vectors of doubles.
+# The kernels have no branch in the loop, so that they run on vectors of doubles.
 @kernel
-def circle(image, low, high, width, cells, stride, index):  # type: ignore[no-untyped-def]
-    """Wrap into [low, high] and add stride (k mod cells), k = floor((x - low)/width + EDGE).
+def on_circle(x, low, high, width, cells):  # type: ignore[no-untyped-def]
+    """Wrap into [low, high] and return k mod cells, k = floor((x - low)/width + EDGE).
 
     NaN beyond MOST_TURNS turns. A state near ``high`` may have k = cells.
     """
     span = high - low
-    for i in range(len(image)):
-        x = image[i]
-        away = x - low
-        turns = np.floor(away / span)
-        rest = away - turns * span
-        rest = rest if rest > 0.0 else 0.0
-        rest = rest if rest < span else span
-        wrapped = low + rest
-        wrapped = wrapped if wrapped < high else high
-        x = x if (x >= low) & (x <= high) else wrapped
-        k = np.floor((x - low) / width + EDGE)
-        k = k if k < cells else 0.0
-        index[i] += stride * k if abs(turns) <= MOST_TURNS else np.nan
+    away = x - low
+    turns = np.floor(away / span)
+    rest = away - turns * span
+    rest = rest if rest > 0.0 else 0.0
+    rest = rest if rest < span else span
+    wrapped = low + rest
+    wrapped = wrapped if wrapped < high else high
+    x = x if (x >= low) & (x <= high) else wrapped
+    k = np.floor((x - low) / width + EDGE)
+    k = k if k < cells else 0.0
+    return k if abs(turns) <= MOST_TURNS else np.nan
 
 
 @kernel
-def interval(image, low, high, width, cells, stride, clip, index):  # type: ignore[no-untyped-def]
-    """Add stride k, k = floor((x - low)/width + EDGE), for 0 <= k < cells; NaN elsewhere.
+def on_interval(x, low, high, width, cells, clip):  # type: ignore[no-untyped-def]
+    """Return k = floor((x - low)/width + EDGE) for 0 <= k < cells; NaN elsewhere.
 
     The last cell has all images up to ``high``, and up to EDGE above itself. With ``clip`` a
     finite image is moved into the interval first.
     """
+    finite = abs(x) < np.inf
+    if clip:
+        x = low if x < low else x
+        x = high if x > high else x
+    t = (x - low) / width
+    k = np.floor(t + EDGE)
+    last = (k >= cells) & ((t - cells <= EDGE) | (x <= high))
+    k = cells - 1.0 if last else k
+    return k if finite & (k >= 0.0) & (k < cells) else np.nan
+
+
+@kernel
+def circle(image, low, high, width, cells, stride, index):  # type: ignore[no-untyped-def]
+    """Add the indices on a circle, times the stride."""
     for i in range(len(image)):
-        x = image[i]
-        finite = abs(x) < np.inf
-        if clip:
-            x = low if x < low else x
-            x = high if x > high else x
-        t = (x - low) / width
-        k = np.floor(t + EDGE)
-        last = (k >= cells) & ((t - cells <= EDGE) | (x <= high))
-        k = cells - 1.0 if last else k
-        index[i] += stride * k if finite & (k >= 0.0) & (k < cells) else np.nan
+        index[i] += stride * on_circle(image[i], low, high, width, cells)
+
+
+@kernel
+def interval(image, low, high, width, cells, stride, clip, index):  # type: ignore[no-untyped-def]
+    """Add the indices on an interval, times the stride."""
+    for i in range(len(image)):
+        index[i] += stride * on_interval(image[i], low, high, width, cells, clip)

@@ -33,8 +33,8 @@ from lmdsl.results.directory import reading, writing
 from lmdsl.results.directory.certificate_file import SCOPE, CertificateFile
 from lmdsl.results.directory.reading import FORMAT, Reading
 from lmdsl.results.result import ARRAYS, Result
-from lmdsl.systems import FunctionSystem
-from lmdsl.systems.named import NotStored
+from lmdsl.systems import NAMED, FunctionSystem, System
+from lmdsl.systems.named import NamedOde, NotStored
 
 TYPES = {
     "control_index": "<i4",
@@ -238,7 +238,13 @@ def _result(
 
 def _problem(data: Any) -> Problem:
     system = data.get("system") if isinstance(data, dict) else None
-    if not (isinstance(system, dict) and system.get("kind") == "function"):
+    if not isinstance(system, dict):
+        return parse_problem(data)
+    kind = str(system.get("kind"))
+    if "judged" not in system and (kind == "ode" or issubclass(NAMED.get(kind, System), NamedOde)):
+        # Saved before paths were judged: the files mean what they meant.
+        return parse_problem({**data, "system": {**system, "judged": "endpoint"}})
+    if kind != "function":
         return parse_problem(data)
     # A function cannot be stored: everything but calling it still works.
     stand_in = FunctionSystem(next=_not_stored, parameters=system.get("parameters", {}))

@@ -1,0 +1,286 @@
+"""The way of a sample through the box: where it first enters the attractor, avoid or the outside.
+
+The path of a Runge-Kutta step is a cubic Hermite arc for each substep. It is judged at its parts
+in order, from the first after the start to the image, and the earliest event decides: entering the
+attractor absorbs the sample there; leaving the box or entering avoid is an escape.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Bools, Floats, Guard
+from lmdsl.machine.kernels import kernel
+from lmdsl.model.grid.axis import on_circle, on_interval
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.sets import CellSets
+from lmdsl.systems.runge_kutta import RungeKutta
+
+MOST_PARTS = 1_000
+"""Parts of an arc at most; else twice as many as it is cells long, by its steepest end."""
+
+FAR = 8
+"""Distances in cells from what decides a path are told apart up to this one."""
+
+
+class Endings(NamedTuple):
+    """What became of samples.
+
+    Attributes
+    ----------
+    cell
+        Index of the cell that decides: of the first event, or of the image; NaN outside. It has
+        the shape of the samples.
+    place
+        Where that is, not wrapped, shape (d, samples), or (0, samples) where nobody asks.
+    integral
+        Integral of the cost rate until then, NaN where the rate was negative or not a number on
+        the way; shape (samples,), or (0,) without a rate.
+    """
+
+    cell: Floats
+    place: Floats
+    integral: Floats
+
+
+class Arcs(NamedTuple):
+    """The paths of samples.
+
+    Attributes
+    ----------
+    state, slope
+        Knots of all samples, shape (substeps + 1, d and integrals, samples).
+    cell
+        Cells of the knots, shape (substeps + 1, samples), NaN outside.
+    speed
+        Greatest speed along each arc, in cells of an axis, shape (substeps, samples).
+    parts
+        Number of parts of each arc of a sample, shape (samples,).
+    """
+
+    state: Floats
+    slope: Floats
+    cell: Floats
+    speed: Floats
+    parts: Floats
+
+
+class Ground(NamedTuple):
+    """What the box is where a path leads.
+
+    Attributes
+    ----------
+    axes
+        The numbers of the axes, shape (d, 6).
+    number, attractor
+        Target of every cell, shape (N,): negative in avoid, ``attractor`` in the attractor.
+    room
+        See :func:`_room`.
+    forbid
+        Whether leaving the box on the way is an escape.
+    """
+
+    axes: Floats
+    number: NDArray[np.int32]
+    attractor: int
+    room: NDArray[np.uint8]
+    forbid: bool
+
+
+class PathJudge:
+    """Judges the paths of samples; it may be called from several threads at once.
+
+    Parameters
+    ----------
+    flow
+        Integrates the equation, and the cost rate where there is one.
+    partition, sets
+        The box and its sets.
+    endpoint
+        Whether only the image is judged.
+    """
+
+    def __init__(
+        self, flow: RungeKutta, partition: Partition, sets: CellSets, endpoint: bool
+    ) -> None:
+        self.flow, self.partition, self.endpoint = flow, partition, endpoint
+        free = (sets.number >= 0) & ~sets.attractor
+        self.ground = Ground(
+            np.array(partition.axes, dtype=np.float64),
+            sets.number,
+            len(sets.free),
+            _room(free.reshape(partition.shape), partition.periodic),
+            not partition.clip,
+        )
+
+    def __call__(
+        self, values: Mapping[str, Floats], shape: tuple[int, ...], guard: Guard, places: bool
+    ) -> Endings:
+        """Judge samples given as named arrays that broadcast to ``shape``; see :class:`Endings`."""
+        flow, d, integrals = self.flow, self.partition.dimension, self.flow.integrals
+        count, arcs = math.prod(shape), flow.substeps
+        state, slope, rate = self._knots(values, shape, guard)
+        knots = self._cells(state, count)
+        cell, arc, time = np.empty(count), np.full(count, arcs - 1), np.ones(count)
+        if self.endpoint:
+            cell = knots[-1]
+        else:
+            speed, parts = np.zeros((arcs, count)), np.zeros(count)
+            _speeds(state, slope, self.ground.axes, speed, parts)
+            _judge(Arcs(state, slope, knots, speed, parts), self.ground, cell, arc, time)
+        place, integral = np.empty((d if places else 0, count)), np.empty(count * integrals)
+        _places(state, slope, arc, time, place)
+        if integrals:
+            _integrals(state, slope, rate, d, arc, time, integral)
+        return Endings(cell.reshape(shape), place, integral)
+
+    def _knots(
+        self, values: Mapping[str, Floats], shape: tuple[int, ...], guard: Guard
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return the knots' states and slopes and the integrand at the stages; see _judge."""
+        flow = self.flow
+        outputs, integrals, arcs = len(flow.field.formulas), flow.integrals, flow.substeps
+        state, slope = (np.empty((arcs + 1, outputs, *shape)) for _ in range(2))
+        rate = np.empty((arcs, 4 * integrals, *shape))
+        for s, knot in enumerate(flow.knots(values, guard)):
+            for k in range(outputs):
+                state[s, k], slope[s, k] = knot.state[k], knot.slope[k]
+            for i, stage in enumerate(knot.stages):
+                for k in range(integrals):
+                    rate[s, 4 * k + i] = stage[k]
+        state, slope, rate = (
+            x.reshape(*x.shape[:2], math.prod(shape)) for x in (state, slope, rate)
+        )
+        return state, slope, rate
+
+    def _cells(self, state: Floats, count: int) -> Floats:
+        """Return the cells of the knots, NaN outside; under ``clip`` the image is moved first."""
+        cells = np.empty((len(state), count))
+        for s, knot in enumerate(state):
+            last = s == len(state) - 1
+            cells[s] = self.partition.index(
+                list(knot[: self.partition.dimension]), self.partition.clip and last
+            )
+        return cells
+
+
+def _room(free: Bools, periodic: Bools) -> NDArray[np.uint8]:
+    """Return how near, in cells, something else than a free cell may be to each cell, at most FAR.
+
+    Where it is r, the cells less than r away on every axis are free.
+    """
+    room = np.zeros(free.shape, dtype=np.uint8)
+    inside = free
+    for _ in range(FAR):
+        room += inside
+        for k in range(free.ndim):
+            lines = np.moveaxis(inside, k, 0)
+            first, last = (lines[:1], lines[-1:]) if periodic[k] else (False & lines[:1],) * 2
+            before, after = np.concatenate([last, lines[:-1]]), np.concatenate([lines[1:], first])
+            inside = np.moveaxis(lines & before & after, 0, k)
+    return room.ravel()
+
+
+@kernel
+def _speeds(state, slope, axes, speed, parts):  # type: ignore[no-untyped-def]
+    """Fill in ``speed`` and ``parts`` of :class:`Arcs`, zeros on entry."""
+    count = np.uint64(len(parts))
+    for k in range(len(axes)):
+        scale = 1.0 / axes[k, 2]
+        for s in range(len(slope)):
+            m = slope[s, k]
+            for i in range(count):
+                steep = abs(m[i]) * scale
+                parts[i] = steep if steep > parts[i] else parts[i]
+        for s in range(len(speed)):
+            a, b, m, n, line = state[s, k], state[s + 1, k], slope[s, k], slope[s + 1, k], speed[s]
+            for i in range(count):
+                bend = abs(3.0 * (b[i] - a[i]) - m[i] - n[i])  # Bernstein coefficients
+                most = max(max(abs(m[i]), abs(n[i])), bend) * scale
+                most = most if most >= 0.0 else np.inf  # not a number
+                line[i] = most if most > line[i] else line[i]
+    for i in range(count):
+        whole = np.ceil(2.0 * parts[i])
+        whole = whole if whole > 1.0 else 1.0
+        parts[i] = whole if whole < MOST_PARTS else MOST_PARTS
+
+
+@kernel
+def _cell(state, slope, s, t, i, axes):  # type: ignore[no-untyped-def]
+    """Return the cell of sample i at time t of arc s, NaN outside."""
+    index = 0.0
+    for k in range(len(axes)):
+        x = _hermite(state, slope, s, t, k, i)
+        low, high, width, cells = axes[k, 0], axes[k, 1], axes[k, 2], axes[k, 3]
+        if axes[k, 5] > 0.0:
+            index += axes[k, 4] * on_circle(x, low, high, width, cells)
+        else:
+            index += axes[k, 4] * on_interval(x, low, high, width, cells, False)
+    return index
+
+
+@kernel
+def _hermite(state, slope, s, t, k, i):  # type: ignore[no-untyped-def]
+    """Return component k of sample i at time t of arc s."""
+    a, b = state[s, k, i], state[s + 1, k, i]
+    r = 1.0 - t
+    bend = r * (slope[s, k, i] - (b - a)) - t * (slope[s + 1, k, i] - (b - a))
+    return r * a + t * b + t * r * bend
+
+
+@kernel
+def _judge(arcs, ground, cell, arc, time):  # type: ignore[no-untyped-def]
+    """Fill in which cell decides, on which arc and when on it; see :class:`Endings`."""
+    state, slope, knots, speed, parts = arcs
+    axes, number, attractor, room, forbid = ground
+    for i in range(np.uint64(len(cell))):
+        s, t, at, ended = 0, 1.0, knots[0, i], False
+        while not ended:
+            j = 0.0
+            while not ended and j < parts[i]:
+                free = room[np.int64(at)] - 1.0001 if at >= 0.0 else 0.0
+                blind = free * parts[i] < speed[s, i] * (parts[i] - j)  # other cells may be met
+                j = j + max(1.0, np.floor(free / speed[s, i] * parts[i])) if blind else parts[i]
+                t = j / parts[i]
+                at = knots[s + 1, i] if j == parts[i] else _cell(state, slope, s, t, i, axes)
+                if at >= 0.0:
+                    n = number[np.int64(at)]
+                    ended = (n < 0) | (n == attractor)
+                else:
+                    ended = forbid
+            if s == len(speed) - 1:
+                break
+            s += not ended
+        cell[i], arc[i], time[i] = at, s, t
+
+
+@kernel
+def _places(state, slope, arc, time, place):  # type: ignore[no-untyped-def]
+    """Fill in where the samples are then, shape (d, samples); at the end of an arc exactly."""
+    for k in range(len(place)):
+        for i in range(len(arc)):
+            s = arc[i]
+            end = time[i] == 1.0
+            x = state[s + 1, k, i] if end else _hermite(state, slope, s, time[i], k, i)
+            place[k, i] = x
+
+
+@kernel
+def _integrals(state, slope, rate, k, arc, time, integral):  # type: ignore[no-untyped-def]
+    """Fill in component k, an integral, until then; it never decreases along an arc.
+
+    Where the integrand was negative or not a number before, it is that.
+    """
+    for i in range(len(integral)):
+        s = arc[i]
+        value = state[s + 1, k, i]
+        if time[i] < 1.0:
+            value = min(max(_hermite(state, slope, s, time[i], k, i), state[s, k, i]), value)
+        for r in range(s + 1):
+            for stage in range(rate.shape[1]):
+                if not rate[r, stage, i] >= 0.0:
+                    value = rate[r, stage, i]
+        integral[i] = value

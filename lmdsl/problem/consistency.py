@@ -1,0 +1,109 @@
+"""Whether the keys of a problem fit together: names, and what is counted by axis or by point."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from lmdsl.errors import BadInput, shown
+from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
+from lmdsl.systems import OdeSystem
+from lmdsl.systems.named import NamedOde
+
+if TYPE_CHECKING:
+    from lmdsl.problem.problem import Problem
+
+
+def require_consistent(problem: "Problem") -> None:
+    """Refuse a problem whose names stand twice or nowhere; its formulas are parsed elsewhere."""
+    _unique_names(problem)
+    _one_cost(problem)
+    _sets_named(problem)
+    _local_named(problem)
+
+
+def _unique_names(problem: "Problem") -> None:
+    kinds = {
+        "state_box": problem.states,
+        "control_grid": problem.controls,
+        "noise": problem.noises,
+        "system.parameters": tuple(problem.system.constants()),
+    }
+    owner: dict[str, str] = {}
+    for kind, names in kinds.items():
+        for name in names:
+            if name in owner:
+                raise BadInput(f"the name {name!r} is also used in {owner[name]}", kind)
+            owner[name] = kind
+
+
+def _one_cost(problem: "Problem") -> None:
+    if problem.stage_cost is None and problem.cost_rate is None:
+        raise BadInput(
+            "required key is missing; write the cost of a step as a formula", "stage_cost"
+        )
+    if problem.cost_rate is None:
+        return
+    if problem.stage_cost is not None:
+        raise BadInput("stage_cost is given as well; keep one of them", "cost_rate")
+    if not isinstance(problem.system, OdeSystem | NamedOde):
+        raise BadInput(
+            "a map has no time between its steps; write a stage_cost, or an ode", "cost_rate"
+        )
+
+
+def _sets_named(problem: "Problem") -> None:
+    states = problem.states
+    _points_named(problem.attractor.points, states, "attractor.points")
+    for i, cell in enumerate(problem.attractor.cells):
+        if len(cell) != len(states):
+            raise BadInput(f"{len(cell)} indices for {len(states)} axes", f"attractor.cells[{i}]")
+    for where in ("attractor", "avoid", "measure"):
+        part = getattr(problem, where)
+        for i, box in enumerate((part.boxes or ()) if part else ()):
+            _box_named(box, states, f"{where}.boxes[{i}]")
+
+
+def _points_named(points: Any, states: tuple[str, ...], where: str) -> None:
+    for i, point in enumerate(points):
+        if isinstance(point, dict) and set(point) != set(states):
+            raise BadInput(f"a point names every axis once: {', '.join(states)}", f"{where}[{i}]")
+        if len(point) != len(states):
+            raise BadInput(f"{len(point)} coordinates for {len(states)} axes", f"{where}[{i}]")
+
+
+def _box_named(box: Mapping[str, tuple[float, float]], states: tuple[str, ...], where: str) -> None:
+    for name, (a, b) in box.items():
+        if name not in states:
+            axes = ", ".join(states)
+            raise BadInput(f"{shown(name)} is not an axis; the axes are {axes}", where)
+        if not a < b:
+            raise BadInput(f"[{a!r}, {b!r}] is empty; write [a, b] with a < b", f"{where}.{name}")
+
+
+def _local_named(problem: "Problem") -> None:
+    local, top = problem.local_controller, "local_controller"
+    if local is None:
+        return
+    orbit = () if isinstance(local, ConstantControl) else local.orbit
+    _points_named(orbit, problem.states, f"{top}.orbit")
+    tables: list[tuple[str, Any, Any]] = [("control", local.control, problem.controls)]
+    if isinstance(local, LqrFeedback):
+        tables.append(("state_weights", local.state_weights, problem.states))
+        tables.append(("control_weights", local.control_weights, problem.controls))
+    if isinstance(local, LinearFeedback):
+        tables.append(("gain", local.gain, problem.controls))
+        tables += [(f"gain.{u}", row, problem.states) for u, row in local.gain.items()]
+    for key, table, known in tables:
+        for name in table:
+            if name not in known:
+                choice = f"one of {', '.join(known)}" if known else "nothing: there is none"
+                raise BadInput(f"{shown(name)} is unknown; write {choice}", f"{top}.{key}")
+    along = {"control": local.control}
+    if isinstance(local, LinearFeedback):
+        along |= {f"gain.{u}": row for u, row in local.gain.items()}
+    for key, table in along.items():
+        for name, values in table.items():
+            if isinstance(values, tuple) and len(values) != len(orbit):
+                raise BadInput(
+                    f"{len(values)} values for {len(orbit)} orbit points; give one each",
+                    f"{top}.{key}.{name}",
+                )

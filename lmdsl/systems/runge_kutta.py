@@ -1,0 +1,140 @@
+"""The classical Runge-Kutta method of order four: an equation becomes a map, its steps a path."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lmdsl.common.types import Floats, Guard
+from lmdsl.formulas.enclosures import Jet
+from lmdsl.formulas.language import Formula
+from lmdsl.formulas.program import Program
+from lmdsl.formulas.tracing import Recorder
+from lmdsl.machine.forking import cached_property
+
+MOST_WRITTEN = 1_000
+"""Operations, and nodes of the formulas times substeps, up to which a step is written out."""
+
+
+class Knot(NamedTuple):
+    """Where two substeps meet; between knots the path is a cubic Hermite arc.
+
+    Attributes
+    ----------
+    state
+        One array per state and integral, each in the shape of what it depends on. Not wrapped.
+    slope
+        Their time derivatives times the length of a substep.
+    stages
+        The derivatives of the integrals at the four stages of the substep that begins here; empty
+        at the last knot.
+    """
+
+    state: tuple[Floats, ...]
+    slope: tuple[Floats, ...]
+    stages: tuple[tuple[Floats, ...], ...] = ()
+
+
+class _Substep(NamedTuple):
+    slopes: tuple[tuple[Any, ...], ...]  # k1 to k4
+    end: tuple[Any, ...]
+
+
+class RungeKutta:
+    """x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4), repeated; h = step / substeps.
+
+    Parameters
+    ----------
+    field
+        The derivatives of the states, and after them those of integrals that are 0 at the start.
+    states
+        Names of the states.
+    step, substeps
+        Sampling time, and the number of steps into which it is divided.
+    """
+
+    def __init__(self, field: Program, states: tuple[str, ...], step: float, substeps: int) -> None:
+        self.field, self.states = field, states
+        self.substeps, self.h = substeps, step / substeps
+        self.integrals = len(field.formulas) - len(states)
+        self.live = field.live + 8 * len(field.formulas)
+        self.effort, self.work = (
+            substeps * (4 * each + 14 * len(field.formulas)) for each in (field.effort, field.work)
+        )
+
+    def __call__(self, values: Mapping[str, Any], guard: Guard | None = None) -> tuple[Floats, ...]:
+        """See :class:`lmdsl.systems.base.StateMap`."""
+        with np.errstate(all="ignore"):
+            images: tuple[Floats, ...] = self._last(
+                values, self._start(values), partial(self.field, guard=guard)
+            )
+        return images
+
+    def knots(self, values: Mapping[str, Any], guard: Guard | None = None) -> Iterator[Knot]:
+        """Yield the start and the ends of all substeps; the last state is the image."""
+        field, d = partial(self.field, guard=guard), len(self.states)
+        state = self._start(values)
+        with np.errstate(all="ignore"):
+            for slopes, end in self._substeps(values, state, field):
+                slope = tuple(self.h * k for k in slopes[0])
+                yield Knot(state, slope, tuple(k[d:] for k in slopes))
+                state = end
+            last = field({**values, **dict(zip(self.states, state, strict=False))})
+            yield Knot(state, tuple(self.h * k for k in last))
+
+    @cached_property
+    def formulas(self) -> tuple[Formula, ...] | None:
+        """The images written out as formulas, None where these are too long to be of use."""
+        nodes = sum(len(formula.subformulas) for formula in self.field.formulas)
+        if max(self.effort, self.substeps * nodes) > MOST_WRITTEN:
+            return None
+        recorder = Recorder()
+        start = tuple(recorder.name(name) for name in self.states)
+
+        def slope(values: Mapping[str, Any]) -> tuple[Any, ...]:
+            return recorder.replay(
+                self.field.formulas, {name: values[name] for name in self.states}
+            )
+
+        return tuple(recorder.formula(image) for image in self._last({}, start, slope))
+
+    def enclose(self, values: Mapping[str, Jet], guard: Guard | None = None) -> tuple[Jet, ...]:
+        """Enclose the images and their derivatives on boxes."""
+        start = tuple(values[name] for name in self.states)
+        with np.errstate(all="ignore"):
+            images: tuple[Jet, ...] = self._last(
+                values, start, partial(self.field.enclose, guard=guard)
+            )
+        return images
+
+    def _start(self, values: Mapping[str, Any]) -> tuple[Floats, ...]:
+        start = tuple(np.asarray(values[name], float) for name in self.states)
+        return (*start, *(np.zeros(()) for _ in range(self.integrals)))
+
+    def _last(self, values: Mapping[str, Any], start: tuple[Any, ...], field: Any) -> Any:
+        for substep in self._substeps(values, start, field):
+            end = substep.end
+        return end
+
+    def _substeps(
+        self, values: Mapping[str, Any], state: tuple[Any, ...], field: Any
+    ) -> Iterator[_Substep]:
+        """Step arrays, jets or terms: the arithmetic is the same."""
+        held, h = dict(values), self.h
+
+        def slope(at: Sequence[Any]) -> tuple[Any, ...]:
+            held.update(zip(self.states, at, strict=False))
+            image: tuple[Any, ...] = field(held)
+            return image
+
+        for _ in range(self.substeps):
+            k1 = slope(state)
+            k2 = slope([x + (h / 2) * k for x, k in zip(state, k1, strict=True)])
+            k3 = slope([x + (h / 2) * k for x, k in zip(state, k2, strict=True)])
+            k4 = slope([x + h * k for x, k in zip(state, k3, strict=True)])
+            state = tuple(
+                x + (h / 6) * (a + 2 * b + 2 * c + d)
+                for x, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
+            )
+            yield _Substep((k1, k2, k3, k4), state)
