@@ -18,6 +18,7 @@ from importlib.metadata import (
 from importlib.util import find_spec
 
 from lmdsl.backends.base import Backend, Capabilities
+from lmdsl.common import spelling
 from lmdsl.errors import BadInput, MissingDependency, plain_text, shown
 from lmdsl.machine import quiet
 from lmdsl.machine.forking import whole
@@ -60,7 +61,8 @@ def get(name: str) -> Backend:
         backend = _loaded(name, offered[name])
     else:
         raise BadInput(
-            f"{shown(name)} is not a backend; the backends are {', '.join(map(_said, names()))}",
+            f"{shown(name)} is not a backend{spelling.hint(name, names()) or ';'} the "
+            f"backends are {', '.join(map(_said, names()))}",
             "backend",
         )
     for package in backend.requires:
@@ -136,7 +138,8 @@ def resolve(spec: str | Backend) -> tuple[Backend, str | None]:
     known = backend.capabilities.algorithms
     if algorithm and known and algorithm not in known:
         raise BadInput(
-            f"{shown(algorithm)} is not an algorithm of {name}; it has {', '.join(known)}",
+            f"{shown(algorithm)} is not an algorithm of {name}"
+            f"{spelling.hint(algorithm, known) or ';'} it has {', '.join(known)}",
             "backend",
         )
     return backend, algorithm or None

@@ -5,6 +5,7 @@ from typing import Any
 
 from lmdsl.cli.output import Arguments, Command, print_json, shared
 from lmdsl.cli.streams import say
+from lmdsl.common import spelling
 from lmdsl.errors import BadInput, printable, shown
 
 
@@ -48,7 +49,9 @@ def _init(parsed: Arguments) -> int:
     from lmdsl.systems import NAMED
 
     if parsed.name not in NAMED:
-        raise BadInput(f"{shown(parsed.name)} is not a system; known: {', '.join(NAMED)}", "NAME")
+        near = spelling.hint(parsed.name, NAMED) or ";"
+        known = ", ".join(NAMED)
+        raise BadInput(f"{shown(parsed.name)} is not a system{near} known: {known}", "NAME")
     path = Path(parsed.out if parsed.out is not None else f"{parsed.name}.json")
     if path.exists():
         raise BadInput(f"{shown(str(path), 200)} exists; remove it or choose another name", "out")

@@ -1,12 +1,12 @@
 """What pydantic finds wrong, as one line: every fault with its path, the value and the fix."""
 
-import difflib
 from collections.abc import Iterator, Mapping
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
 
 from pydantic import BaseModel, Tag, ValidationError
 
+from lmdsl.common import spelling
 from lmdsl.common.files import joined
 from lmdsl.errors import BadInput, shown
 
@@ -72,6 +72,8 @@ def _fault(item: Mapping[str, Any], model: type[BaseModel]) -> _Fault:
         return _Fault(where, _ADD)
     if kind == "extra_forbidden":
         return _unknown(where, location, model)
+    if kind == "kind":
+        return _kind(where, item)
     fix = _FIXES.get(kind)
     if location[-1:] == ("[key]",):
         fix = "names are strings"
@@ -82,24 +84,31 @@ def _fault(item: Mapping[str, Any], model: type[BaseModel]) -> _Fault:
     return _Fault(where, f"{shown(given)} is not accepted; {fix}")
 
 
+def _kind(where: str, item: Mapping[str, Any]) -> _Fault:
+    given, listed = item["input"], item["msg"]
+    if not isinstance(given, Mapping):
+        fix = f"write an object with a kind: {listed}"
+        return _Fault(where, f"{shown(given)} is not accepted; {fix}")
+    if "kind" not in given:
+        return _Fault(where, f"kind is missing; the kinds are {listed}")
+    kind = given["kind"]
+    near = spelling.hint(kind, listed.split(", "), spelling.KINDS) or ";"
+    return _Fault(
+        joined(where, "kind"), f"{shown(kind)} is not a kind{near} the kinds are {listed}"
+    )
+
+
 def _plain(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _unknown(where: str, location: tuple[int | str, ...], model: type[BaseModel]) -> _Fault:
     allowed = sorted({key for kind in _models(model, location[:-1]) for key in kind.model_fields})
-    near = nearest(str(location[-1]), allowed)
+    near = spelling.nearest(str(location[-1]), allowed, spelling.KEYS)
     if near is None:
         known = f" (known keys: {', '.join(allowed)})" if allowed else ""
         return _Fault(where, f"unknown key; remove it or correct its spelling{known}")
     return _Fault(where, f"unknown key; did you mean {near!r}?", _path((*location[:-1], near)))
-
-
-def nearest(name: str, known: Any) -> str | None:
-    """Return the known name that a name was probably meant to be, if any."""
-    folded = {key.replace("_", "").lower(): key for key in known}
-    found = difflib.get_close_matches(name[:100].replace("_", "").lower(), folded, 1, 0.75)
-    return folded[found[0]] if found else None
 
 
 def _models(model: type[BaseModel], location: tuple[int | str, ...]) -> list[type[BaseModel]]:

@@ -182,6 +182,8 @@ class Explanation(Frozen):
         lines = [f"{self.lost} of {self.lost + stabilizable} cells outside A and avoid cannot be "
                  "stabilized"]  # fmt: skip
         meaning = {NAMES[status]: text for status, text in MEANING.items()}
+        if self.problem.admissible is not None:
+            meaning[NAMES[CellStatus.ESCAPES]] += ", or is not admissible at one"
         for cause in self.causes:
             lines += ["", f"{cause.name}, {cause.cells} cells: {meaning[cause.name]}"]
             for region in cause.regions:

@@ -122,7 +122,9 @@ class _Trial:
         flat = p.locate(images)
         finite = np.logical_and.reduce([np.isfinite(x) for x in images])
         code = np.where(flat >= 0, self.status[flat].astype(np.int64), -1)
-        return images, over, np.where(finite, code, np.int64(CellStatus.AVOID))
+        admitted = self.sampler.admits(named)
+        fine = finite if admitted is None else finite & admitted
+        return images, over, np.where(fine, code, np.int64(CellStatus.AVOID))
 
     def side(self, number: int) -> tuple[str, str, float, float]:
         """Return axis, end, its place and the length of the axis, of a side of the box."""

@@ -33,8 +33,8 @@ class Move(Frozen):
     control
         The control, by name.
     kind
-        ``leaves`` the box, enters ``avoid``, is ``not finite``, or ``enters`` a cell that is not
-        stabilizable.
+        ``leaves`` the box, enters ``avoid``, is ``not finite``, is ``not admissible`` (the
+        condition of the problem does not hold), or ``enters`` a cell that is not stabilizable.
     state, noise, image
         The first sample that does so, and where it lands, or is judged on the way; noise is empty
         without noise.
@@ -58,6 +58,12 @@ class Move(Frozen):
 
     def __str__(self) -> str:
         control = _shown(self.control)
+        if self.kind == "not admissible":
+            at = _shown({**self.state, **self.control})
+            return (
+                f"{control or 'it'} is not admissible at {100 * self.share:.3g} % of the samples: "
+                f"the condition does not hold at {at}"
+            )
         start = f"{control} loses" if control else "it loses"
         sample = (
             f"{start} {100 * self.share:.3g} % of the samples: "
@@ -169,9 +175,15 @@ def _move(sampler: Sampler, status: Statuses, cell: int, control: int) -> Move:
     bad = leaving
     if not leaving.any():
         bad = (code != CellStatus.STABILIZED) & (code != CellStatus.ATTRACTOR)
-    s = int(np.argmax(bad))
     block = Block(0, np.array([cell]), (control, control + 1))
     values = sampler.values(block)
+    admitted = sampler.admits(values)
+    refused = np.zeros(len(flat), dtype=np.bool_)
+    if admitted is not None:
+        shape = (1, len(sampler.points), len(nodes.weights), 1)
+        refused = ~np.broadcast_to(admitted, shape).ravel()
+        bad = refused if refused.any() else bad
+    s = int(np.argmax(bad))
     point, node = divmod(s, len(nodes.weights))
     image = sampler.places(block)[:, s].tolist()
     problem = sampler.problem
@@ -182,6 +194,8 @@ def _move(sampler: Sampler, status: Statuses, cell: int, control: int) -> Move:
         "image": dict(zip(problem.states, image, strict=True)),
         "share": float(weight[bad].sum()),
     }
+    if refused[s]:
+        return Move(kind="not admissible", **found)
     if flat[s] >= 0 and leaving.any():
         return Move(kind="avoid", **found)
     if flat[s] >= 0:

@@ -9,11 +9,11 @@ as computed: the same operations in the same order, each within its error. A jet
 
 The mean value form M = F(c) + F'(b) (b - c) is far tighter than N where the box is small, but it
 contains F(b) only: f(b) lies in M + [-e, e], and so in its intersection with N (:func:`enclosure`).
-Comparisons, floor and sign are decided by N alone; so f and F then take the same branch. A function
-with a jump (floor, sign, an undecided ``where``) gets the whole line as derivative, so that only
-its range counts. Where a value may be infinite or undefined, everything made of it is the whole
-line: NumPy's NaN cannot hide behind a ``max`` or a ``tanh``. A bound that is infinite or NaN is
-none.
+Comparisons, floor, mod and sign are decided by N alone; so f and F then take the same branch. A
+function with a jump (floor, mod, sign, an undecided ``where``) gets the whole line as derivative,
+so that only its range counts. Where a value may be infinite or undefined, everything made of it is
+the whole line: NumPy's NaN cannot hide behind a ``max`` or a ``tanh``. A bound that is infinite or
+NaN is none.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ import numpy as np
 from lmdsl.formulas import intervals as iv
 from lmdsl.formulas.intervals import Interval
 from lmdsl.formulas.operations import FORMULA_FUNCTIONS
+from lmdsl.formulas.truths import COMPARED, JOINED, Truth
 
 
 class Jet:
@@ -257,10 +258,37 @@ def _power(a: Jet, b: Jet) -> Jet:
     )
 
 
-def _where(condition: tuple[Any, Any] | Jet, a: Jet, b: Jet) -> Jet:
-    if isinstance(condition, Jet):  # a comparison of constants, folded to 0 or 1
-        condition = (condition.value.low != 0, condition.value.low != 0)
-    surely, possibly = condition
+def _remainder(a: Jet, b: Jet) -> Jet:
+    turns = iv.floors(a.value, b.value)
+    value = iv.remainder(a.value, b.value, turns)
+    around = iv.floors(iv.outward(*a.value), b.value)  # at a jump it has no slope
+    smooth = around.low == around.high
+    k = Interval(*(np.where(smooth, t, 0.0) for t in around))
+    slope = iv.subtract(a.slope, iv.multiply(k, b.slope))
+    slope = iv.either(smooth, slope, iv.whole(slope.low))
+    moved = a.error + iv.magnitude(turns) * b.error  # the quotient's floor is exact
+    error = np.where(turns.low == turns.high, _rounded(moved, value), _width(value))
+    return _made(value, slope, error, a, b)
+
+
+def truth(condition: Truth | Jet) -> Truth:
+    """Return what is known of a condition; one of constants is folded to 0 or 1."""
+    if isinstance(condition, Jet):
+        holds = condition.value.low != 0
+        return holds, holds
+    return condition
+
+
+def _compared(name: str) -> Callable[[Jet, Jet], Truth]:
+    return lambda a, b: COMPARED[name](a.value, b.value)
+
+
+def _joined(name: str) -> Callable[..., Truth]:
+    return lambda *conditions: JOINED[name](*map(truth, conditions))
+
+
+def _where(condition: Truth | Jet, a: Jet, b: Jet) -> Jet:
+    surely, possibly = truth(condition)
     both = iv.hull(a.value, b.value)
     value = iv.either(surely, a.value, iv.either(possibly, both, b.value))
     undecided = iv.whole(np.broadcast_arrays(a.slope.low, b.slope.low, surely)[0])
@@ -269,32 +297,11 @@ def _where(condition: tuple[Any, Any] | Jet, a: Jet, b: Jet) -> Jet:
     return Jet(value, slope, error)
 
 
-# A comparison of jets: (it holds everywhere, it may hold somewhere).
-def _less(a: Jet, b: Jet) -> tuple[Any, Any]:
-    return a.value.high < b.value.low, a.value.low < b.value.high
-
-
-def _less_equal(a: Jet, b: Jet) -> tuple[Any, Any]:
-    return a.value.high <= b.value.low, a.value.low <= b.value.high
-
-
-def _equal(a: Jet, b: Jet) -> tuple[Any, Any]:
-    one = (a.value.low == a.value.high) & (b.value.low == b.value.high)
-    meet = (a.value.low <= b.value.high) & (b.value.low <= a.value.high)
-    return one & meet, meet
-
-
-def _unequal(a: Jet, b: Jet) -> tuple[Any, Any]:
-    surely, possibly = _equal(a, b)
-    return ~possibly, ~surely
-
-
 _OPERATIONS: Final[dict[str, Callable[..., Any]]] = {
     "+": Jet.__add__, "-": Jet.__sub__, "*": Jet.__mul__, "/": Jet.__truediv__,
     "negative": Jet.__neg__, "**": _power, "abs": _absolute, "min": _smaller, "max": _larger,
-    "atan2": _angle, "where": _where,
-    "<": _less, "<=": _less_equal, ">": lambda a, b: _less(b, a),
-    ">=": lambda a, b: _less_equal(b, a), "==": _equal, "!=": _unequal,
+    "atan2": _angle, "where": _where, "mod": _remainder,
+    **{name: _compared(name) for name in COMPARED}, **{name: _joined(name) for name in JOINED},
     **{name: _smooth(name) for name in _SMOOTH}, **{name: _stepped(name) for name in _STEPS},
 }  # fmt: skip
 

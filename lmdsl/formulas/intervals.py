@@ -94,12 +94,17 @@ def intersection(a: Interval, b: Interval) -> Interval:
 
 def add(a: Interval, b: Interval) -> Interval:
     """Return a + b."""
-    return outward(a.low + b.low, a.high + b.high)
+    return _summed(a.low + b.low, a.high + b.high)
 
 
 def subtract(a: Interval, b: Interval) -> Interval:
     """Return a - b."""
-    return outward(a.low - b.high, a.high - b.low)
+    return _summed(a.low - b.high, a.high - b.low)
+
+
+def _summed(low: Any, high: Any) -> Interval:
+    """Widen sums: those so small that a unit in the last place vanishes are exact, 0 stays 0."""
+    return _widened(low, high, 2 * ROUNDING, 0.0)
 
 
 def negative(a: Interval) -> Interval:
@@ -116,7 +121,9 @@ def multiply(a: Interval, b: Interval) -> Interval:
     low, high = products[0], products[0]
     for p in products[1:]:
         low, high = np.minimum(low, p), np.maximum(high, p)
-    return outward(low, high)
+    value = outward(low, high)
+    positive = (a.low >= 0) & (b.low >= 0)  # so that the root of a sum of squares is defined
+    return Interval(np.where(positive, np.maximum(value.low, 0.0), value.low), value.high)
 
 
 def square(a: Interval) -> Interval:
@@ -215,3 +222,33 @@ def angle(y: Interval, x: Interval) -> Interval:
     value = loosened(low, high)
     turn = loosened(np.full(np.shape(low), -math.pi), np.full(np.shape(low), math.pi))
     return either(cut, turn, value)
+
+
+def floors(a: Interval, b: Interval) -> Interval:
+    """Return the least and largest floor(a / b), exact for ends that are doubles.
+
+    NaN where b may be zero, and beyond 2^50, where quotients are no longer told apart.
+    """
+    corners = [_floor(x, y) for x in a for y in b]  # a / b is extreme at corners
+    low, high = corners[0], corners[0]
+    for c in corners[1:]:
+        low, high = np.minimum(low, c), np.maximum(high, c)
+    sound = ((b.low > 0) | (b.high < 0)) & (np.abs(low) < _EXACT) & (np.abs(high) < _EXACT)
+    return Interval(np.where(sound, low, np.nan), np.where(sound, high, np.nan))
+
+
+_EXACT: Final = 2.0**50
+
+
+def _floor(a: Any, b: Any) -> Any:
+    rest = np.fmod(a, b)  # exact, and so is the whole number of b in a - rest but for one rounding
+    return np.rint((a - rest) / b) - ((rest != 0) & (np.signbit(rest) != np.signbit(b)))
+
+
+def remainder(a: Interval, b: Interval, turns: Interval) -> Interval:
+    """Return mod(a, b) from the floors of a / b: a - k b where there is one, else 0 to b."""
+    one = turns.low == turns.high
+    bound = Interval(np.minimum(b.low, 0.0), np.maximum(b.high, 0.0))
+    exact = subtract(a, multiply(Interval(*(np.where(one, k, 0.0) for k in turns)), b))
+    value = either(one, intersection(exact, bound), bound)
+    return either((b.low <= 0) & (b.high >= 0), whole(value.low), value)

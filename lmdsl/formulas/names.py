@@ -2,11 +2,12 @@
 
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 
 from lmdsl.common.strict_model import Number, SchemaWords, frozen_dict, plain
-from lmdsl.formulas.language import MAX_CHARACTERS, MAX_NAME, check_name
+from lmdsl.formulas.language import MAX_NAME, check_name
 from lmdsl.formulas.operations import RESERVED
+from lmdsl.formulas.parser import MAX_CHARACTERS
 
 
 def _named(value: dict[str, Any]) -> dict[str, Any]:
@@ -30,6 +31,31 @@ named_keys = SchemaWords(
         }
     }
 )
+
+MAX_DEFINITIONS = 200
+MAX_CONDITIONS = 100
+
+# Named subexpressions, in order.
+Let = Annotated[
+    dict[str, FormulaText],
+    Field(max_length=MAX_DEFINITIONS),
+    BeforeValidator(plain),
+    valid_names,
+    named_keys,
+    frozen_dict,
+]
+
+# A condition, or a list of them of which one holds.
+Conditions = Annotated[
+    Annotated[FormulaText, Tag("<a>")]
+    | Annotated[
+        tuple[FormulaText, ...],
+        Field(min_length=1, max_length=MAX_CONDITIONS, fail_fast=True),
+        Tag("<b>"),
+    ],
+    Discriminator(lambda v: "<b>" if isinstance(v, list | tuple) else "<a>"),
+    BeforeValidator(plain),
+]
 
 # Named constants of a system.
 Parameters = Annotated[

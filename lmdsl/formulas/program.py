@@ -9,9 +9,12 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Floats, Guard
 from lmdsl.errors import BadInput
-from lmdsl.formulas.enclosures import Jet, apply
-from lmdsl.formulas.language import Formula, Subformula, fold
+from lmdsl.formulas.enclosures import Jet, apply, truth
+from lmdsl.formulas.intervals import Interval
+from lmdsl.formulas.language import Formula
 from lmdsl.formulas.operations import OPERATIONS, PLAIN
+from lmdsl.formulas.parser import Subformula, fold
+from lmdsl.formulas.truths import Truth
 
 
 class Instruction(NamedTuple):
@@ -160,6 +163,27 @@ class Program:
         ``values`` has a jet for each of `names`, all with the same number of directions.
         """
         directions = max((len(jet.slope.low) for jet in values.values()), default=0)
+        return tuple(self._enclosed(values, directions, guard))
+
+    def decide(
+        self, values: Mapping[str, Interval], guard: Guard | None = None
+    ) -> tuple[Truth, ...]:
+        """Return of all formulas, which are conditions, what is known of them on boxes.
+
+        Parameters
+        ----------
+        values
+            An interval for each of `names`.
+        guard
+            Called before every operation; it may raise.
+        """
+        none = Interval.point(np.zeros((0, 1)))
+        jets = {name: Jet(values[name], none, 0.0) for name in self.names}
+        return tuple(truth(found) for found in self._enclosed(jets, 0, guard))
+
+    def _enclosed(
+        self, values: Mapping[str, Jet], directions: int, guard: Guard | None
+    ) -> list[Any]:
         slots: list[Any] = [
             None if value is None else Jet.constant(value, directions) for value in self.template
         ]
@@ -170,7 +194,7 @@ class Program:
                 if guard is not None:
                     guard()
                 slots[target] = apply(operation, [slots[k] for k in operands])
-        return tuple(slots[slot] for slot in self.outputs)
+        return [slots[slot] for slot in self.outputs]
 
 
 FUNCTION = 40  # additions that take as long as a sine or a cosine, the slowest functions there are

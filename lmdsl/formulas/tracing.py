@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from lmdsl.formulas.language import Formula, Subformula
+from lmdsl.formulas.language import Formula
+from lmdsl.formulas.parser import Subformula
 
 
 class Recorder:

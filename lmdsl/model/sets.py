@@ -14,6 +14,7 @@ from lmdsl.errors import BadInput
 from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.grid import conditions
 from lmdsl.model.grid.partition import Partition
 from lmdsl.problem.problem import Problem
 
@@ -58,13 +59,7 @@ class CellSets:
         memory.require(CELL * partition.size, "the sets of cells")
         guard = partial(Deadline.of(deadline).raise_if_over, "compiling")
         attractor = _attractor(problem, partition, guard)
-        avoid = np.zeros(partition.size, dtype=np.bool_)
-        if problem.avoid:
-            boxes = (
-                partition.overlapping_box(box, f"avoid.boxes[{i}]")
-                for i, box in enumerate(problem.avoid.boxes)
-            )
-            avoid = partition.mask(boxes, guard)
+        avoid = _avoid(problem, partition, guard)
         both = np.flatnonzero(attractor & avoid)
         if len(both):
             index = [int(k) for k in np.unravel_index(both[0], partition.shape)]
@@ -75,6 +70,25 @@ class CellSets:
         number[free] = np.arange(len(free), dtype=np.int32)
         number[attractor] = len(free)
         return cls(attractor, avoid, mass, free, number)
+
+
+def _conditions(problem: Problem, where: str, partition: Partition, guard: Guard) -> Bools:
+    """Return the cells on which a condition of ``attractor`` or ``measure`` certainly holds."""
+    found = np.zeros(partition.size, dtype=np.bool_)
+    for condition in problem.conditions(where):
+        found |= conditions.certain(condition, problem.system.constants(), partition, guard)
+    return found
+
+
+def _avoid(problem: Problem, partition: Partition, guard: Guard) -> Bools:
+    boxes = (
+        partition.overlapping_box(box, f"avoid.boxes[{i}]")
+        for i, box in enumerate((problem.avoid and problem.avoid.boxes) or ())
+    )
+    mask = partition.mask(boxes, guard)
+    for condition in problem.conditions("avoid"):
+        mask |= conditions.possible(condition, problem.system.constants(), partition, guard)
+    return mask
 
 
 def _mass(problem: Problem, partition: Partition, guard: Guard) -> Floats:
@@ -104,13 +118,16 @@ def _mass(problem: Problem, partition: Partition, guard: Guard) -> Floats:
                 "and >= 0",
                 "measure.density",
             )
-    if declared.boxes is not None:
+    if declared.boxes is not None or declared.where is not None:
         boxes = (
-            partition.inside_box(box, f"measure.boxes[{i}]") for i, box in enumerate(declared.boxes)
+            partition.inside_box(box, f"measure.boxes[{i}]")
+            for i, box in enumerate(declared.boxes or ())
         )
         inside = partition.mask(boxes, guard)
+        inside |= _conditions(problem, "measure", partition, guard)
         if not inside.any():
-            raise BadInput("no cell lies inside the boxes; enlarge them", "measure.boxes")
+            key = "where" if declared.boxes is None else "boxes"
+            raise BadInput(_NO_CELL[key], f"measure.{key}")
         mass[~inside] = 0.0
     if not mass.any():
         raise BadInput("no cell carries weight; widen the boxes or the density", "measure")
@@ -139,6 +156,14 @@ def _attractor(problem: Problem, partition: Partition, guard: Guard) -> Bools:
                     f"attractor.cells[{i}]",
                 )
     mask = partition.mask(itertools.chain(points, boxes, cells), guard)  # one at a time
+    mask |= _conditions(problem, "attractor", partition, guard)
     if not mask.any():
-        raise BadInput("no cell lies inside the boxes; enlarge them or give points", "attractor")
+        key = "where" if declared.where and not declared.boxes else "boxes"
+        raise BadInput(f"{_NO_CELL[key]} or give points", "attractor")
     return mask
+
+
+_NO_CELL = {
+    "boxes": "no cell lies inside the boxes; enlarge them",
+    "where": "on no cell as a whole the condition certainly holds; widen it, use smaller cells",
+}

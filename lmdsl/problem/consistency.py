@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from lmdsl.common import spelling
 from lmdsl.errors import BadInput, shown
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
 from lmdsl.systems import OdeSystem
@@ -26,6 +27,7 @@ def _unique_names(problem: "Problem") -> None:
         "control_grid": problem.controls,
         "noise": problem.noises,
         "system.parameters": tuple(problem.system.constants()),
+        "let": tuple(problem.let or ()),
     }
     owner: dict[str, str] = {}
     for kind, names in kinds.items():
@@ -73,8 +75,9 @@ def _points_named(points: Any, states: tuple[str, ...], where: str) -> None:
 def _box_named(box: Mapping[str, tuple[float, float]], states: tuple[str, ...], where: str) -> None:
     for name, (a, b) in box.items():
         if name not in states:
+            near = spelling.hint(name, states) or ";"
             axes = ", ".join(states)
-            raise BadInput(f"{shown(name)} is not an axis; the axes are {axes}", where)
+            raise BadInput(f"{shown(name)} is not an axis{near} the axes are {axes}", where)
         if not a < b:
             raise BadInput(f"[{a!r}, {b!r}] is empty; write [a, b] with a < b", f"{where}.{name}")
 
@@ -96,7 +99,8 @@ def _local_named(problem: "Problem") -> None:
         for name in table:
             if name not in known:
                 choice = f"one of {', '.join(known)}" if known else "nothing: there is none"
-                raise BadInput(f"{shown(name)} is unknown; write {choice}", f"{top}.{key}")
+                near = spelling.hint(name, known) or ";"
+                raise BadInput(f"{shown(name)} is unknown{near} write {choice}", f"{top}.{key}")
     along = {"control": local.control}
     if isinstance(local, LinearFeedback):
         along |= {f"gain.{u}": row for u, row in local.gain.items()}

@@ -15,8 +15,8 @@ from lmdsl.common import inputs
 from lmdsl.common.files import read_json, write_whole
 from lmdsl.common.strict_model import Declared, FileSchema, Positive
 from lmdsl.errors import BadInput, shown
-from lmdsl.formulas.language import Formula, parse
-from lmdsl.formulas.names import FormulaText
+from lmdsl.formulas.language import Definitions, Formula, defined, parse, parse_condition
+from lmdsl.formulas.names import FormulaText, Let
 from lmdsl.formulas.program import Program
 from lmdsl.problem.axes import StateBox
 from lmdsl.problem.consistency import require_consistent
@@ -38,12 +38,16 @@ class Problem(Declared):
     ----------
     system
         x+ = T(x, u, w).
+    let
+        Named subexpressions, in order, for the formulas and conditions below and in the system.
     state_box
         Axes in order; the cells are their C-order product.
     attractor
         The set A to reach.
     control_grid
         Control variables; the control vectors are the C-order product of their values.
+    admissible
+        Condition in states and controls without which a pair is inadmissible.
     stage_cost
         Formula G(x, u, w), finite and >= 0.
     cost_rate
@@ -68,10 +72,12 @@ class Problem(Declared):
     format: Literal["lmdsl/1"] = "lmdsl/1"
     name: Annotated[str, Field(max_length=1000)] = ""
     system: SystemUnion
+    let: Let | None = None
     state_box: StateBox
     attractor: Attractor
     avoid: Avoid | None = None
     control_grid: ControlGrid
+    admissible: FormulaText | None = None
     noise: Noise | None = None
     stage_cost: FormulaText | None = None
     cost_rate: FormulaText | None = None
@@ -99,6 +105,9 @@ class Problem(Declared):
         self.cost()
         self.terminal()
         self.density()
+        self.admitted()
+        for where in ("attractor", "avoid", "measure"):
+            self.conditions(where)
         return self
 
     @classmethod
@@ -135,24 +144,16 @@ class Problem(Declared):
     def step(self) -> StateMap:
         """Return the map of the system, from named arrays to images."""
         system: System = self.system
-        return system.compile(self.states, self.controls, self.noises)
-
-    @property
-    def judged(self) -> Judged:
-        """Whether ``path`` or ``endpoint`` of a step is judged; a map has no path."""
-        judged: Judged = getattr(self.system, "judged", "endpoint")
-        return judged
-
-    def flow(self) -> RungeKutta | None:
-        """Return how the equation, and the cost rate, is integrated; None for a map."""
-        system: System = self.system
-        rate = None if self.cost_rate is None else self.cost()
-        return system.flow(self.states, self.controls, self.noises, rate)
+        return system.compile(self.states, self.controls, self.noises, self.definitions())
 
     def formula(
-        self, text: str, where: str, kinds: Collection[str] = ("state", "control", "noise")
+        self,
+        text: str,
+        where: str,
+        kinds: Collection[str] = ("state", "control", "noise"),
+        condition: bool = False,
     ) -> Formula:
-        """Return a formula of this problem, parsed.
+        """Return a formula or condition of this problem, parsed.
 
         Parameters
         ----------
@@ -162,7 +163,9 @@ class Problem(Declared):
             The path of its field.
         kinds
             What may stand in it beside parameters and constants: names of states, of controls and
-            of noise variables.
+            of noise variables; and what ``let`` defines by these.
+        condition
+            Whether it is a condition.
 
         Raises
         ------
@@ -174,9 +177,29 @@ class Problem(Declared):
         for kind in kinds:
             names.update(known[kind])
         try:
-            return parse(text, names)
+            return (parse_condition if condition else parse)(text, names, self.definitions())
         except BadInput as error:
             raise BadInput(error.message, where) from None
+
+    def definitions(self) -> Definitions:
+        """Return what ``let`` defines, parsed."""
+        names = (*self.states, *self.controls, *self.noises, *self.system.constants())
+        try:
+            return defined(tuple((self.let or {}).items()), names)
+        except BadInput as error:
+            raise BadInput(error.message, f"let.{error.where}") from None
+
+    @property
+    def judged(self) -> Judged:
+        """Whether ``path`` or ``endpoint`` of a step is judged; a map has no path."""
+        judged: Judged = getattr(self.system, "judged", "endpoint")
+        return judged
+
+    def flow(self) -> RungeKutta | None:
+        """Return how the equation, and the cost rate, is integrated; None for a map."""
+        system: System = self.system
+        rate = None if self.cost_rate is None else self.cost()
+        return system.flow(self.states, self.controls, self.noises, rate, self.definitions())
 
     def cost(self) -> Formula:
         """Return the parsed stage cost, or cost rate."""
@@ -199,6 +222,23 @@ class Problem(Declared):
         if self.measure is None or self.measure.density is None:
             return None
         return self.formula(self.measure.density, "measure.density", ("state",))
+
+    def admitted(self) -> Formula | None:
+        """Return the condition of admissible pairs, None where there is none."""
+        if self.admissible is None:
+            return None
+        return self.formula(self.admissible, "admissible", ("state", "control"), condition=True)
+
+    def conditions(self, where: str) -> tuple[Formula, ...]:
+        """Return the conditions of ``attractor``, ``avoid`` or ``measure``."""
+        part = getattr(self, where)
+        texts = () if part is None or part.where is None else part.where
+        if isinstance(texts, str):
+            return (self.formula(texts, f"{where}.where", ("state",), condition=True),)
+        return tuple(
+            self.formula(text, f"{where}.where[{i}]", ("state",), condition=True)
+            for i, text in enumerate(texts)
+        )
 
     def __eq__(self, other: object) -> bool:
         """Compare all keys, and the order of axes and controls: it numbers cells and vectors."""

@@ -7,7 +7,7 @@ from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, mod
 
 from lmdsl.common.strict_model import Box, Declared, Number, Numbers, frozen_dict, plain
 from lmdsl.errors import BadInput
-from lmdsl.formulas.names import FormulaText
+from lmdsl.formulas.names import Conditions, FormulaText
 from lmdsl.problem.unions import EachWords
 
 MAX_BOXES = 10_000  # number of boxes, points or cells above which a set is refused
@@ -39,7 +39,7 @@ CellIndices = Annotated[tuple[CellIndex, ...], Field(fail_fast=True), BeforeVali
 
 
 class Attractor(Declared):
-    """The attractor cells: the union of points, boxes and cells.
+    """The attractor cells: the union of points, boxes, cells and conditions.
 
     Attributes
     ----------
@@ -49,13 +49,15 @@ class Attractor(Declared):
         The cells inside a box (up to 1e-9 widths).
     cells
         Multi-indices of cells.
+    where
+        A condition in the states, or several: the cells on all of which one certainly holds.
     """
 
     model_config = ConfigDict(
         json_schema_extra={
             "anyOf": [
-                {"required": [key], "properties": {key: {"not": {"maxItems": 0}}}}
-                for key in ("points", "boxes", "cells")
+                {"required": [key], "properties": {key: {"not": {"type": "array", "maxItems": 0}}}}
+                for key in ("points", "boxes", "cells", "where")
             ]
         }
     )
@@ -63,18 +65,38 @@ class Attractor(Declared):
     points: Points = ()
     boxes: Boxes = ()
     cells: CellIndices = ()
+    where: Conditions | None = None
 
     @model_validator(mode="after")
     def _something(self) -> Self:
-        if not (self.points or self.boxes or self.cells):
-            raise BadInput("no attractor cell; give points, boxes or cells")
+        if not (self.points or self.boxes or self.cells or self.where is not None):
+            raise BadInput("no attractor cell; give points, boxes, cells or where")
         return self
 
 
 class Avoid(Declared):
-    """Unsafe cells: every cell whose interior overlaps a box. Landing there counts as leaving."""
+    """Unsafe cells: landing there counts as leaving.
 
-    boxes: SomeBoxes
+    Attributes
+    ----------
+    boxes
+        Every cell whose interior overlaps one.
+    where
+        A condition in the states, or several: every cell in which one may hold somewhere.
+    """
+
+    model_config = ConfigDict(
+        json_schema_extra={"anyOf": [{"required": [key]} for key in ("boxes", "where")]}
+    )
+
+    boxes: SomeBoxes | None = None
+    where: Conditions | None = None
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if self.boxes is None and self.where is None:
+            raise BadInput("nothing to avoid; give boxes or where")
+        return self
 
 
 class Measure(Declared):
@@ -84,6 +106,9 @@ class Measure(Declared):
     ----------
     boxes
         Only the cells inside their union carry weight.
+    where
+        A condition in the states, or several: the cells on all of which one certainly holds carry
+        weight, those in boxes too.
     density
         Formula in the states, evaluated at the centre of each cell; finite and >= 0. Default 1.
     weights
@@ -92,19 +117,20 @@ class Measure(Declared):
 
     model_config = ConfigDict(
         json_schema_extra={
-            "anyOf": [{"required": [key]} for key in ("boxes", "density", "weights")],
+            "anyOf": [{"required": [key]} for key in ("boxes", "where", "density", "weights")],
             "not": {"required": ["density", "weights"]},
         }
     )
 
     boxes: SomeBoxes | None = None
+    where: Conditions | None = None
     density: FormulaText | None = None
     weights: Annotated[Numbers, EachWords({"minimum": 0})] | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> Self:
-        if self.boxes is None and self.density is None and self.weights is None:
-            raise BadInput("give boxes, a density or weights")
+        if all(x is None for x in (self.boxes, self.where, self.density, self.weights)):
+            raise BadInput("give boxes, where, a density or weights")
         if self.density is not None and self.weights is not None:
             raise BadInput("density and weights exclude each other; keep one")
         for i, weight in enumerate(self.weights or ()):

@@ -45,7 +45,7 @@ def kinds(*models: type[Declared]) -> Any:
         Discriminator(
             _tag_by_kind,
             custom_error_type="kind",
-            custom_error_message=f"'kind' is missing or unknown; known kinds: {names}",
+            custom_error_message=names,
         ),
     ]
 

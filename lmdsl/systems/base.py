@@ -11,11 +11,12 @@ from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import BeforeValidator, Field
 
+from lmdsl.common import spelling
 from lmdsl.common.strict_model import Declared, Positive, plain
 from lmdsl.common.types import Floats, Guard
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.enclosures import Jet
-from lmdsl.formulas.language import Formula, parse
+from lmdsl.formulas.language import NO_DEFINITIONS, Definitions, Formula, parse
 from lmdsl.formulas.names import Formulas, Parameters
 from lmdsl.formulas.program import Program
 from lmdsl.systems.runge_kutta import RungeKutta
@@ -30,6 +31,7 @@ def program(
     names: Sequence[str],
     parameters: Mapping[str, float],
     where: str,
+    definitions: Definitions = NO_DEFINITIONS,
 ) -> Program:
     """Compile the formulas of the states, in the given order, into one program.
 
@@ -40,14 +42,13 @@ def program(
             raise BadInput(f"no formula for state {state!r}; add one", where)
     for state in formulas:
         if state not in order:
-            raise BadInput(
-                f"{shown(state)} is not an axis of state_box; remove it or declare the axis", where
-            )
+            near = spelling.hint(state, order) or "; remove it or declare the axis"
+            raise BadInput(f"{shown(state)} is not an axis of state_box{near}", where)
     known = frozenset((*names, *parameters))
     parsed = []
     for state in order:
         try:
-            parsed.append(parse(formulas[state], known))
+            parsed.append(parse(formulas[state], known, definitions))
         except BadInput as error:
             raise BadInput(error.message, f"{where}.{state}") from None
     return Program(parsed, parameters)
@@ -94,9 +95,16 @@ class System(Declared):
         return self.parameters
 
     def compile(
-        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+        self,
+        states: Sequence[str],
+        controls: Sequence[str],
+        noise: Sequence[str],
+        definitions: Definitions = NO_DEFINITIONS,
     ) -> StateMap:
-        """Return the function from named arrays to the images, one array per state in order."""
+        """Return the function from named arrays to the images, one array per state in order.
+
+        Formulas may use ``definitions`` (the ``let`` of a problem).
+        """
         raise NotImplementedError
 
     def flow(
@@ -105,6 +113,7 @@ class System(Declared):
         controls: Sequence[str],
         noise: Sequence[str],
         integrand: Formula | None = None,
+        definitions: Definitions = NO_DEFINITIONS,
     ) -> RungeKutta | None:
         """Return how the differential equation is integrated; None for a map, which has none.
 
@@ -126,11 +135,20 @@ class MapSystem(System):
     next: Formulas
 
     def compile(
-        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+        self,
+        states: Sequence[str],
+        controls: Sequence[str],
+        noise: Sequence[str],
+        definitions: Definitions = NO_DEFINITIONS,
     ) -> StateMap:
         """See :meth:`System.compile`."""
         return program(
-            self.next, states, [*states, *controls, *noise], self.parameters, "system.next"
+            self.next,
+            states,
+            [*states, *controls, *noise],
+            self.parameters,
+            "system.next",
+            definitions,
         )
 
 
@@ -157,10 +175,14 @@ class OdeSystem(System):
     judged: Judged = "path"
 
     def compile(
-        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+        self,
+        states: Sequence[str],
+        controls: Sequence[str],
+        noise: Sequence[str],
+        definitions: Definitions = NO_DEFINITIONS,
     ) -> StateMap:
         """See :meth:`System.compile`."""
-        return self.flow(states, controls, noise)
+        return self.flow(states, controls, noise, None, definitions)
 
     def flow(
         self,
@@ -168,6 +190,7 @@ class OdeSystem(System):
         controls: Sequence[str],
         noise: Sequence[str],
         integrand: Formula | None = None,
+        definitions: Definitions = NO_DEFINITIONS,
     ) -> RungeKutta:
         """See :meth:`System.flow`."""
         field = program(
@@ -176,6 +199,7 @@ class OdeSystem(System):
             [*states, *controls, *noise],
             self.parameters,
             "system.derivative",
+            definitions,
         )
         if integrand is not None:
             field = Program([*field.formulas, integrand], self.parameters)

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from lmdsl.common.types import Floats, Guard
 from lmdsl.errors import BadInput, shown
+from lmdsl.formulas.language import NO_DEFINITIONS, Definitions
 from lmdsl.machine.surroundings import restore_rounding
 from lmdsl.systems.base import StateMap, System
 
@@ -53,7 +54,11 @@ class FunctionSystem(System):
         return {"not": {}}
 
     def compile(
-        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+        self,
+        states: Sequence[str],
+        controls: Sequence[str],
+        noise: Sequence[str],
+        definitions: Definitions = NO_DEFINITIONS,
     ) -> StateMap:
         """See :meth:`System.compile`."""
         return FunctionMap(self.next, tuple(states), dict(self.parameters))

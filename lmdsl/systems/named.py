@@ -6,9 +6,10 @@ from typing import Any, ClassVar, Self
 
 from pydantic import model_validator
 
+from lmdsl.common import spelling
 from lmdsl.common.strict_model import Positive
 from lmdsl.errors import BadInput, shown
-from lmdsl.formulas.language import Formula
+from lmdsl.formulas.language import NO_DEFINITIONS, Definitions, Formula
 from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
 from lmdsl.systems.base import Judged, MapSystem, OdeSystem, StateMap, Substeps, System
 from lmdsl.systems.runge_kutta import RungeKutta
@@ -42,8 +43,10 @@ class NamedSystem(System):
         for name in self.parameters:
             if name not in self.defaults:
                 known = ", ".join(self.defaults) or "none"
+                near = spelling.hint(name, self.defaults) or ";"
                 raise BadInput(
-                    f"{shown(name)} is not a parameter of {self.kind}; its parameters: {known}",
+                    f"{shown(name)} is not a parameter of {self.kind}{near} its parameters: "
+                    f"{known}",
                     "parameters",
                 )
         return self
@@ -64,7 +67,11 @@ class NamedSystem(System):
         raise NotImplementedError
 
     def compile(
-        self, states: Sequence[str], controls: Sequence[str], noise: Sequence[str]
+        self,
+        states: Sequence[str],
+        controls: Sequence[str],
+        noise: Sequence[str],
+        definitions: Definitions = NO_DEFINITIONS,
     ) -> StateMap:
         """See :meth:`System.compile`."""
         if set(states) != set(self.formulas):
@@ -123,6 +130,7 @@ class NamedOde(NamedSystem):
         controls: Sequence[str],
         noise: Sequence[str],
         integrand: Formula | None = None,
+        definitions: Definitions = NO_DEFINITIONS,
     ) -> RungeKutta:
         """See :meth:`System.flow`."""
         return self.definition().flow(states, controls, noise, integrand)

@@ -38,13 +38,17 @@ def formula(rng, depth, plain):
     if kind < 0.5:
         return f"({inner()} {rng.choice(list('+-*/'))} {inner()})"
     if kind < 0.6:
-        return f"where({inner()} {rng.choice(['<', '<=', '>', '>=', '==', '!='])} {inner()}, " + (
-            f"{inner()}, {inner()})"
-        )
+
+        def comparison():
+            return f"{inner()} {rng.choice(['<', '<=', '>', '>=', '==', '!='])} {inner()}"
+
+        joined = rng.choice(["{}", "not {}", "{} and {}", "not ({} or {})", "{} or {}"])
+        condition = joined.format(comparison(), comparison())
+        return f"where({condition}, {inner()}, {inner()})"
     if kind < 0.7:
         return f"{rng.choice(STEPS)}({inner()})"
     if kind < 0.8 or plain:
-        return f"{rng.choice(['min', 'max'])}({inner()}, {inner()})"
+        return f"{rng.choice(['min', 'max', 'mod', 'mod'])}({inner()}, {inner()})"
     if kind < 0.92:
         return f"{rng.choice(UNARY)}({inner()})"
     if kind < 0.97:
@@ -93,6 +97,20 @@ def enclosed(program, low, high):
     return [float(np.ravel(end)[0]) for end in (*found, image.error)]
 
 
+def true(node, at):
+    """Whether a plain condition holds over the rationals."""
+    if isinstance(node, ast.BoolOp):
+        found = [true(k, at) for k in node.values]
+        return all(found) if isinstance(node.op, ast.And) else any(found)
+    if isinstance(node, ast.UnaryOp):
+        return not true(node.operand, at)
+    a, b = (rational(k, at) for k in (node.left, node.comparators[0]))
+    return {
+        ast.Lt: a < b, ast.LtE: a <= b, ast.Gt: a > b, ast.GtE: a >= b, ast.Eq: a == b,
+        ast.NotEq: a != b,
+    }[type(node.ops[0])]  # fmt: skip
+
+
 def rational(node, at):
     """The value of a plain formula over the rationals, its constants folded in doubles."""
     if not any(isinstance(part, ast.Name) and part.id in at for part in ast.walk(node)):
@@ -109,12 +127,7 @@ def rational(node, at):
         return a + b if kind is ast.Add else a - b if kind is ast.Sub else a * b
     name, arguments = node.func.id, node.args
     if name == "where":
-        a, b = (rational(k, at) for k in (arguments[0].left, arguments[0].comparators[0]))
-        holds = {
-            ast.Lt: a < b, ast.LtE: a <= b, ast.Gt: a > b, ast.GtE: a >= b, ast.Eq: a == b,
-            ast.NotEq: a != b,
-        }[type(arguments[0].ops[0])]  # fmt: skip
-        return rational(arguments[1 if holds else 2], at)
+        return rational(arguments[1 if true(arguments[0], at) else 2], at)
     values = [rational(k, at) for k in arguments]
     return {
         "abs": lambda a: abs(a),
@@ -123,6 +136,7 @@ def rational(node, at):
         "sign": lambda a: Fraction((a > 0) - (a < 0)),
         "min": min,
         "max": max,
+        "mod": lambda a, b: a - b * math.floor(a / b),
     }[name](*values)
 
 

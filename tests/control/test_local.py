@@ -171,7 +171,7 @@ def test_it_survives_saving_and_a_false_one_is_found(tmp_path):
 @pytest.mark.parametrize(
     ("local", "message"),
     [
-        ({"kind": "pid"}, "'kind' is missing or unknown; known kinds: constant"),
+        ({"kind": "pid"}, "'pid' is not a kind; the kinds are constant, linear, lqr"),
         ({"kind": "constant", "control": {"v": 0}}, "local_controller.control: 'v' is unknown"),
         ({"kind": "constant", "control": {"u": 2}}, "control.u: 2.0 is outside the control grid"),
         ({"kind": "lqr", "orbit": []}, "local_controller.orbit: "),

@@ -14,6 +14,17 @@ from lmdsl.formulas.language import Formula, parse
 from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
 from lmdsl.formulas.program import Program
 
+JOINED = ["{0}", "({0})", "not {0}", "{0} and {1}", "{0} or\t{1}", "not ({0} or {1})",
+          "{0} and not {1} or {0}", "not not {0}", "({0} or {1}) and {1}"]  # fmt: skip
+
+
+def conditions(inner):
+    blanks = st.sampled_from(["", " ", "\t"])
+    comparison = st.tuples(
+        inner, st.sampled_from(["<", "<=", ">", ">=", "==", "!="]), blanks, inner
+    ).map("".join)
+    return st.builds(str.format, st.sampled_from(JOINED), comparison, comparison)
+
 
 def expressions():
     numbers = st.one_of(
@@ -32,10 +43,6 @@ def expressions():
             )
 
         binary = st.tuples(inner, blanks, st.sampled_from(["+", "-", "*", "/", "**"]), inner)
-        condition = st.tuples(
-            inner, st.sampled_from(["<", "<=", ">", ">=", "==", "!="]), blanks, inner
-        ).map("".join)
-        condition |= condition.map("({})".format)
         return st.one_of(
             binary.map("".join),
             binary.map("".join),
@@ -43,7 +50,9 @@ def expressions():
             inner.map("({})".format),
             call(1),
             call(2),
-            st.tuples(condition, inner, inner).map(lambda p: f"where({p[0]}, {p[1]} ,{p[2]})"),
+            st.tuples(conditions(inner), inner, inner).map(
+                lambda p: f"where({p[0]}, {p[1]} ,{p[2]})"
+            ),
         )
 
     return st.recursive(leaves, grow, max_leaves=12)
@@ -123,6 +132,8 @@ def test_meaning_of_every_function_against_the_math_module():
             assert value(f"{name}(x)", x=x) == pytest.approx(reference(x), rel=1e-15)
     assert value("abs(y) + sign(y)*8 + floor(y)*64 + ceil(y)", y=y) == abs(y) - 8 - 64
     assert value("atan2(y, x)", x=x, y=y) == pytest.approx(math.atan2(y, x), rel=1e-15)
+    assert value("mod(y, x)", x=x, y=y) == y + 2 * x
+    assert value("mod(x, y)*8 + mod(-0.25, 1)", x=x, y=y) == 8 * (x + y) + 0.75
     assert value("min(x, y)*10 + max(x, y)", x=x, y=y) == y * 10 + x
     assert value("pi", x=x) == math.pi
     assert value("e") == math.e

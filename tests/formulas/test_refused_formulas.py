@@ -27,17 +27,20 @@ HOSTILE = [
     ("x[0]", 1, r"'\['"), ("[x]", 0, r"'\['"), ("{x}", 0, "'{'"), ("{}", 0, "'{'"),
     ("lambda: 0", 0, "keyword"), ("lambda x: x", 0, "keyword"), ("(x := 1)", 3, "':'"),
     ("x = 1", 2, "'='"), ("[x for x in y]", 0, r"'\['"), ("(x for x in y)", 3, "keyword"),
-    ("x if y else u", 2, "keyword"), ("x and y", 2, "keyword"), ("x or y", 2, "keyword"),
-    ("not x", 0, "keyword"), ("x is y", 2, "keyword"), ("x in y", 2, "keyword"),
+    ("x if y else u", 2, "keyword"), ("x and y", 0, "'x' is not a comp"),
+    ("x or y<1", 0, "'x' is not"), ("x<1 and y", 8, "'y' is not a comparison; write one"),
+    ("not x", 4, "'x' is not a comparison"), ("x is y", 2, "keyword"), ("x in y", 2, "keyword"),
     ("True", 0, "keyword"), ("None", 0, "keyword"), ("await x", 0, "keyword"),
-    ("x % y", 2, "'%'"), ("x // y", 3, "'/'"), ("x ^ y", 2, r"'\^'.*write \*\* for"),
+    ("x % y", 2, "'%'.*write mod"), ("x // y", 2, "'//'.*floor"),
+    ("x ^ y", 2, r"'\^'.*write \*\* for"),
     ("x @ y", 2, "'@'"),
     ("x & y", 2, "'&'"), ("x | y", 2, r"'\|'"), ("~x", 0, "'~'"), ("x << 2", 3, "'<'"),
     ("x # a comment", 2, "'#'"), ("x\n+ y", 1, r"'\\n'"), ("x\r", 1, r"'\\r'"),
     ("x\x0c+y", 1, r"'\\x0c'"), ("x\x00", 1, r"'\\x00'"), ("x\u00a0+ y", 1, r"'\\xa0'"),
     ("x\\\ny", 1, r"'\\\\'"), ("'x'", 0, "language"), ('"x"', 0, "language"), ("`x`", 0, "'`'"),
     ("x; y", 1, "';'"), ("x, y", 1, "','"), ("x,", 1, "','"), (",x", 0, "','"), ("$x", 0, r"'\$'"),
-    ("x?", 1, r"'\?'"), ("x!", 1, "'!'"), ("x <> y", 3, "'>'"), ("...", 0, "'.'"), (".", 0, "'.'"),
+    ("x?", 1, r"'\?'"), ("x!", 1, "'!'"), ("x <> y", 2, "'<>'.*!="),
+    ("...", 0, "'.'"), (".", 0, "'.'"),
     ("\u0663", 0, r"u0663"), ("x + \u0661", 4, "u0661"), ("\uff58", 0, "uff58"),
     ("\uff53in(x)", 0, "uff53"), ("\u00e9", 0, "xe9"), ("x\u0301", 1, "u0301"),
     ("\u03c0", 0, "u03c0"), ("x\u00b2", 1, "xb2"), ("x \u2212 y", 2, "u2212"),
@@ -64,6 +67,20 @@ HOSTILE = [
     ("-(x<y)", 3, "comparison"), ("+(x<y)", 3, "comparison"), ("(x<y)**2", 2, "comparison"),
     ("2**(x<y)", 5, "comparison"), ("sin(x<y)", 5, "comparison"), ("min(x, y<1)", 8, "comparison"),
     ("where(x<1, y<1, 2)", 12, "comparison"), ("where(x<1, 2, y==1)", 15, "comparison"),
+    ("x<y and y<u", 4, "comparison"), ("x + not y<1", 4, "brackets"), ("not", 3, "ends"),
+    ("where(x<1 and,1,2)", 13, "','"), ("where(and x<1,1,2)", 6, "'and'"), ("and", 0, "'and'"),
+    ("where(x<1 and (y), 1, 2)", 14, "comparison"), ("where(not x,1,2)", 10, "'x' is not"),
+    ("where((not x<1) + 1,1,2)", 7, "comparison"), ("where(x < not y<1,1,2)", 10, "brackets"),
+    ("where(1/0>0 and x<1,1,2)", 6, "'1/0'"), ("where(x<1 or 2,1,2)", 13, "'2' is not"),
+    ("where(x<1 && y<1,1,2)", 10, "'&&'.*write and"), ("where(x<1 || y<1,1,2)", 10, "write or"),
+    ("where(!(x<1),1,2)", 6, "write not"), ("where(x=1,1,2)", 7, "write == to"),
+    ("mod", 0, "function"), ("mod(x)", 0, "2 arguments"), ("mod(1, 0)", 0, "not a number"),
+    ("mod x", 0, "function"), ("x + y (mod 1)", 6, "declare the axis periodic"),
+    ("np.sin(x)", 0, "write sin"), ("math.pi", 0, "write pi"), ("np.arctan2(x, y)", 0, "atan2"),
+    ("np.power(x, 2)", 0, r"write x\*\*y"), ("numpy.nothing(x)", 0, "language"),
+    ("arcsin(x)", 0, "mean 'asin'"), ("ln(x)", 0, "mean 'log'"), ("Pi*x", 0, "mean 'pi'"),
+    ("pow(x, 2)", 0, r"write x\*\*y"), ("fmod(x, 1)", 0, "mean 'mod'"), ("U*x", 0, "mean 'u'"),
+    ("|x|", 0, r"write abs\(x\)"), ("x\u00b2 + 1", 1, r"write \*\*2"), ("2\u03c0", 1, "language"),
     ("where(x<y<u,1,2)", 9, "one comparison"), ("where((x<y)<u,1,2)", 11, "one comparison"),
     ("where(x<(y<u),1,2)", 10, "comparison"), ("where(x,1,2)", 6, "'x' is not a comparison"),
     ("where((x),1,2)", 6, r"'\(x\)' is not a comparison"), ("where(1,1,2)", 6, "not a comparison"),
@@ -71,7 +88,7 @@ HOSTILE = [
     ("where(where(x<1,1,2),1,2)", 6, "not a comparison"), ("where(x=1,1,2)", 7, "'='"),
     ("where(x< =1,1,2)", 9, "'='"), ("where(x<1,1)", 0, "3 arguments, not 2"),
     ("where(x<1)", 0, "3 arguments, not 1"), ("where(x<1,1,2,3)", 0, "3 arguments, not 4"),
-    ("where()", 0, "not 0"), ("where", 0, "function"), ("where(x not in y,1,2)", 8, "keyword"),
+    ("where()", 0, "not 0"), ("where", 0, "function"), ("where(x not in y,1,2)", 8, "'not' stands"),
     ("sin", 0, "function"), ("sin x", 0, "function"), ("sin()", 0, "1 argument, not 0"),
     ("sin(x, y)", 0, "1 argument, not 2"), ("atan2(x)", 0, "2 arguments, not 1"),
     ("min(x)", 0, "not 1"), ("max(x, y, u)", 0, "not 3"), ("sin + 1", 0, "function"),
@@ -84,7 +101,7 @@ HOSTILE = [
     ("x +", 3, "ends"), ("x + ", 4, "ends"), ("x + * y", 4, r"'\*'"), ("*x", 0, r"'\*'"),
     ("x ***y", 4, r"'\*'"), ("x** *2", 4, r"'\*'"), ("x * * 2", 4, r"'\*'"), ("-", 1, "ends"),
     ("x/", 2, "ends"), ("x++", 3, "ends"), ("x--", 3, "ends"), ("< x", 0, "'<'"),
-    ("u + sinn(x)", 4, "'sinn' is not a declared name or function; declared names are u, x, y"),
+    ("u + sinn(x)", 4, "'sinn' is not a declared name or function; did you mean 'sin'. declared"),
     ("Sin(x)", 0, "'Sin'"), ("PI", 0, "'PI'"), ("nan", 0, "'nan'"), ("inf", 0, "'inf'"),
     ("z", 0, "declared names are u, x, y"), ("arcsin(x)", 0, "arcsin"), ("pow(x,2)", 0, "pow"),
     ("_", 0, "'_'"), ("x1", 0, "'x1'"), ("a" * 70, 0, "declared"),
@@ -105,7 +122,8 @@ def test_everything_else_is_refused_where_it_stands(text, position, says):
 
 def test_message_of_the_first_fault_reads_as_promised():
     assert str(refused("u*x + sinn(x)")) == (
-        "character 7: 'sinn' is not a declared name or function; declared names are u, x, y"
+        "character 7: 'sinn' is not a declared name or function; did you mean 'sin'? declared "
+        "names are u, x, y"
     )
     assert "no names are declared" in str(refused("x", ()))
     assert len(str(refused("z", [f"n{i}" for i in range(10_000)]))) < 300

@@ -18,7 +18,7 @@ UFUNCS = {
     "atan": np.arctan, "sinh": np.sinh, "cosh": np.cosh, "tanh": np.tanh, "exp": np.exp,
     "log": np.log, "sqrt": np.sqrt, "abs": np.abs, "sign": np.sign, "floor": np.floor,
     "ceil": np.ceil, "atan2": np.arctan2, "min": np.minimum, "max": np.maximum,
-    "where": np.where,
+    "where": np.where, "mod": np.mod,
 }  # fmt: skip
 
 
@@ -74,6 +74,8 @@ class Oracle:
 
     def UnaryOp(self, node):
         operand = self.walk(node.operand)
+        if isinstance(node.op, ast.Not):
+            return np.logical_not(operand)
         return np.negative(operand) if isinstance(node.op, ast.USub) else operand
 
     def BinOp(self, node):
@@ -83,6 +85,13 @@ class Oracle:
             return left * left if constant_two else np.power(left, right)
         function = {ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply}
         return function.get(type(node.op), np.divide)(left, right)
+
+    def BoolOp(self, node):
+        first, *others = [self.walk(value) for value in node.values]
+        join = np.logical_and if isinstance(node.op, ast.And) else np.logical_or
+        for other in others:
+            first = join(first, other)
+        return first
 
     def Compare(self, node):
         assert len(node.ops) == 1

@@ -54,6 +54,7 @@ FUNCTIONS = {
     "atan2": np.arctan2,
     "min": np.minimum,
     "max": np.maximum,
+    "mod": np.mod,
     "where": lambda condition, yes, no: yes if condition else no,
     "pi": np.float64(math.pi),
     "e": np.float64(math.e),
@@ -78,6 +79,35 @@ def formula(text: str) -> Callable[[dict[str, np.float64]], float]:
     def value(names: dict[str, np.float64]) -> np.float64:
         with np.errstate(all="ignore"):
             return eval(code, FUNCTIONS, names)
+
+    return value
+
+
+def parameters_of(problem: dict[str, Any]) -> dict[str, np.float64]:
+    """The parameters of the system by name, defaults included."""
+    system = problem["system"]
+    defaults = {"K": 0.25} if system["kind"] == "standard_map" else {}
+    given = {**defaults, **system.get("parameters", {})}
+    return {name: np.float64(value) for name, value in given.items()}
+
+
+def value_of(problem: dict[str, Any], text: str) -> Callable[[dict[str, float]], float]:
+    """Formula or condition of a problem -> function of the values of states, controls, noise.
+
+    What `let` defines is evaluated first, in order, as far as its names have values.
+    """
+    parameters = parameters_of(problem)
+    definitions = {name: formula(by) for name, by in (problem.get("let") or {}).items()}
+    own = formula(text)
+
+    def value(names: dict[str, float]) -> float:
+        values = {**parameters, **{k: np.float64(v) for k, v in names.items()}}
+        for name, by in definitions.items():
+            try:
+                values[name] = by(values)
+            except NameError:
+                continue
+        return float(own(values))
 
     return value
 
@@ -188,6 +218,35 @@ def cells_overlapped(axes: list[Axis], box: dict[str, list[float]]) -> set[int]:
     )
 
 
+def conditions_of(problem: dict[str, Any], key: str) -> list[str]:
+    """The conditions under `where`, a text or a list of texts."""
+    where = (problem.get(key) or {}).get("where", [])
+    return [where] if isinstance(where, str) else where
+
+
+def cells_where(problem: dict[str, Any], text: str, everywhere: bool) -> set[int]:
+    """Cells on which a condition holds: at all of many points, the corners among them, or at one.
+
+    A cell is judged without EDGE widths at each side. The points decide for a set that is convex
+    (everywhere), and for one whose complement is convex (somewhere); for others only nearly.
+    """
+    axes = read_axes(problem)
+    holds = value_of(problem, text)
+    per_axis = 9 if len(axes) == 1 else 5
+    found = set()
+    for number in range(number_of_cells(axes)):
+        ends = [
+            (a.low + (i + EDGE) * a.width, a.low + (i + 1 - EDGE) * a.width)
+            for a, i in zip(axes, unflat(axes, number), strict=True)
+        ]
+        points = itertools.product(*(np.linspace(*end, per_axis) for end in ends))
+        names = [axis.name for axis in axes]
+        held = (holds(dict(zip(names, point, strict=True))) for point in points)
+        if all(held) if everywhere else any(held):
+            found.add(number)
+    return found
+
+
 def read_axes(problem: dict[str, Any]) -> list[Axis]:
     return [
         Axis(name, float(a["low"]), float(a["high"]), int(a["cells"]), a.get("periodic", False))
@@ -207,6 +266,8 @@ def attractor_cells(problem: dict[str, Any]) -> set[int]:
         found |= cells_inside(axes, box)
     for index in where.get("cells", []):
         found.add(flat(axes, index))
+    for text in conditions_of(problem, "attractor"):
+        found |= cells_where(problem, text, everywhere=True)
     return found
 
 
@@ -215,17 +276,21 @@ def avoid_cells(problem: dict[str, Any]) -> set[int]:
     found: set[int] = set()
     for box in problem.get("avoid", {}).get("boxes", []):
         found |= cells_overlapped(axes, box)
+    for text in conditions_of(problem, "avoid"):
+        found |= cells_where(problem, text, everywhere=False)
     return found
 
 
 def measure_cells(problem: dict[str, Any]) -> set[int] | None:
-    """Cells in the boxes of `measure`; None if the problem has no `measure`."""
+    """Cells in the sets of `measure`; None if the problem has no `measure`."""
     if problem.get("measure") is None:
         return None
     axes = read_axes(problem)
     found: set[int] = set()
-    for box in problem["measure"]["boxes"]:
+    for box in problem["measure"].get("boxes", []):
         found |= cells_inside(axes, box)
+    for text in conditions_of(problem, "measure"):
+        found |= cells_where(problem, text, everywhere=True)
     return found
 
 
@@ -308,19 +373,16 @@ def right_hand_side(problem: dict[str, Any]) -> Callable[[dict[str, float]], lis
     """Make the function of the formulas of a map, or of the derivatives."""
     system = problem["system"]
     states = list(problem["state_box"])
-    parameters = {k: np.float64(v) for k, v in system.get("parameters", {}).items()}
     if system["kind"] == "standard_map":
         texts = STANDARD_MAP
-        parameters = {"K": np.float64(0.25), **parameters}
     elif system["kind"] == "map":
         texts = system["next"]
     else:
         texts = system["derivative"]
-    formulas = [formula(texts[s]) for s in states]
+    formulas = [value_of(problem, texts[s]) for s in states]
 
     def evaluate(names: dict[str, float]) -> list[float]:
-        values = {k: np.float64(v) for k, v in names.items()}
-        return [float(f({**parameters, **values})) for f in formulas]
+        return [f(names) for f in formulas]
 
     return evaluate
 
@@ -378,19 +440,7 @@ def step_function(
 
 def formula_of(problem: dict[str, Any], key: str) -> Callable[[dict[str, float]], float] | None:
     """Make the function of the values of all names that a key holds; None without the key."""
-    system = problem["system"]
-    parameters = {k: np.float64(v) for k, v in system.get("parameters", {}).items()}
-    if system["kind"] == "standard_map":
-        parameters = {"K": np.float64(0.25), **parameters}
-    if key not in problem:
-        return None
-    value = formula(problem[key])
-
-    def evaluate(names: dict[str, float]) -> float:
-        values = {k: np.float64(v) for k, v in names.items()}
-        return float(value({**parameters, **values}))
-
-    return evaluate
+    return value_of(problem, problem[key]) if key in problem else None
 
 
 def cell_of_image(axes: list[Axis], image: list[float], clip: bool) -> int | None:
@@ -453,6 +503,7 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
     if not A or A & Z:
         raise ValueError("no attractor cell, or a cell that is both attractor and avoid")
     step = step_function(problem, axes, A, Z)
+    admissible = value_of(problem, problem.get("admissible", "0 == 0"))
     N = number_of_cells(axes)
 
     model = ReferenceModel(
@@ -485,7 +536,9 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
             costs = []
             for x in samples:
                 for node, (w, _) in enumerate(noise):
-                    key, cost = step(_names(problem, x, control, w))
+                    names = _names(problem, x, control, w)
+                    key, cost = step(names)
+                    key = key if admissible(names) else "escaped"
                     count.setdefault(key, [0] * len(noise))[node] += 1
                     costs.append(cost)
             model.counts[pair] = count

@@ -212,6 +212,12 @@ BY_HAND = {
     "stay for free, discounted": ([0, 1, 1, 1], {1: 0, 2: 0, 3: 0}),
     "stay for free, growing": ([0, 1, 1, 1], {1: 1, 2: 2.25, 3: 3.8125}),
     "all is free": ([0, 1, 1, 1], {1: 0, 2: 0, 3: 0}),
+    "where as a box": ([0, 0, 1, 1, 1, 1], {2: 1, 3: 2, 4: 3, 5: 4}),
+    "where on either side of the seam": ([0, 1, 5, 5, 5, 1, 1, 0], {1: 1, 5: 2, 6: 1}),
+    "where, mod and not": ([0, 1, 0, 1, 1, 1, 1, 0], {1: 1, 3: 1, 4: 2, 5: 3, 6: 4}),
+    # u = 2 is admissible in the cells 3 and 4 only; u = 1 costs 1.25, u = 2 costs 2
+    "admissible by state": ([0, 1, 1, 1, 1], {1: 1.25, 2: 2.5, 3: 3.25, 4: 4.5}),
+    "let in the map and the density": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 3}),
     "measure outside C": ([0, 1, 1, 3], None),
     "measure on one cell": ([0, 1, 1, 1], {1: 1, 2: 2, 3: 3}),
 }

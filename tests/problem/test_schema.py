@@ -43,6 +43,8 @@ VARIED = [
     steps(attractor={"points": [[0.1], {"x": 0.2}], "boxes": [{"x": [0, 0.25]}], "cells": [[0]]}),
     steps(sampling={"kind": "random", "points": 4, "seed": 2}, system=ODE),
     steps(sampling={"kind": "grid", "per_axis": 2}),
+    steps(attractor={"where": "x < 0.3"}, avoid={"where": ["x > 0.8", "x == 0.7"]},
+          measure={"where": "x > 0.4"}, let={"half": "u/2", "d": "half + x"}, admissible="d < 9"),
     {**steps(), "$schema": "./lmdsl.schema.json"},
     *(json.loads(json.dumps(dict(kind.problem))) for kind in lm.systems.NAMED.values()),
     doubling(), standard_map(), *CORNER_CASES,
@@ -228,6 +230,13 @@ def test_bounds_of_the_models_are_in_it(schema):
         ("gamma", 0),
         ("attractor", {"cells": [[-1]]}),
         ("avoid", {"boxes": []}),
+        ("avoid", {}),
+        ("avoid", {"where": []}),
+        ("attractor", {"where": ["x < 1"] * 101}),
+        ("attractor", {"where": ""}),
+        ("admissible", ""),
+        ("let", {"sin": "x"}),
+        ("let", {f"a{k}": "x" for k in range(201)}),
         ("control_grid", {"u": {"values": []}}),
         ("control_grid", {"u": {"low": 0, "high": 1, "points": 0}}),
         ("control_grid", {"u": {"values": [1, 1]}}),
@@ -303,6 +312,8 @@ def test_models_that_embed_a_problem():
     {"boxes": [{"x": [0, 0.3]}]}, {"boxes": []}, {"boxes": None}, {"density": None},
     {"boxes": None, "density": "x", "weights": None}, {"density": "x", "weights": [1, 1, 1, 1]},
     {"weights": [1, 1, 1, 1]}, {"points": [[0.1]]}, {"cells": [[0]]}, {"cells": None},
+    {"where": "x < 1"}, {"where": ["x < 1"]}, {"where": []}, {"where": None},
+    {"where": "x < 1", "boxes": [{"x": [0, 0.3]}]},
 ])  # fmt: skip
 def test_one_of_several_keys_is_needed(schema, key, value):
     data = steps(**{key: value})

@@ -89,6 +89,7 @@ SAMPLE = 40  # additions that take as long as locating and sorting a sample
 CALL = 2_000  # additions that take as long as NumPy's own work for an operation on an array
 
 
+ENCLOSED = 50  # operations on doubles that take as long as one on enclosures, some bisected
 SET = 20_000  # additions that take as long as resolving a point or a box of a set, its cells apart
 
 
@@ -103,9 +104,12 @@ def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
     work = lanes * samples * (locating + step.work + cost.work)
     work += CALL * calls * (step.effort + cost.effort)
     attractor, avoid, weight = problem.attractor, problem.avoid, problem.measure
-    boxes = [attractor.boxes, avoid.boxes if avoid else (), (weight and weight.boxes) or ()]
+    boxes = [attractor.boxes, (avoid and avoid.boxes) or (), (weight and weight.boxes) or ()]
     count = sum(map(len, boxes))
     work += N * count + SET * (count + len(attractor.points) + len(attractor.cells))
+    for where in ("attractor", "avoid", "measure"):
+        for condition in problem.conditions(where):
+            work += ENCLOSED * N * Program([condition], problem.system.constants()).work
     density = problem.density()
     if density is not None:
         work += N * Program([density], problem.system.constants()).work

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Indices
+from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.formulas.program import Program
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import fixed
@@ -100,6 +100,10 @@ class Sampler:
         self.samples = len(self.points) * len(self.nodes.weights)
         self.true_map = TrueMap(problem, partition)
         self.guard = guard = partial(Deadline.of(deadline).raise_if_over, doing)
+        admitted = problem.admitted()
+        self._admitted = (
+            None if admitted is None else Program([admitted], problem.system.constants())
+        )
         step, cost = _written(problem, self.true_map.map), problem.stage()
         self.step = partial(step, guard=guard)
         self.cost = None if cost is None else partial(cost, guard=guard)
@@ -157,7 +161,7 @@ class Sampler:
         if self._entries is not None:
             ends = self._entries.ends(values, self._step, shape, self.guard)
             cost = self._mean(sum(self._by_key(values, ends).values(), np.zeros(())))
-            return self._samples_together(ends.cell), cost
+            return self._samples_together(self._admitted_only(values, ends.cell)), cost
         index = mean = None
         axes, clip, weights = self.partition.axes, self.partition.clip, self.nodes.weights
         if shape[-1] >= LEAST_LINE:
@@ -167,6 +171,9 @@ class Sampler:
                 index, mean = images(values, shape, axes, clip, weighting)
             if costs is not None and costs is not images:
                 _, mean = costs(values, shape, (), clip, weights)
+            if index is not None:
+                index = self._admitted_only(values, index.reshape(shape))
+                index = self._samples_together(index)
         index = self.images(block, values) if index is None else index
         return index, self.costs(block, values) if mean is None else mean
 
@@ -179,7 +186,7 @@ class Sampler:
             index = self.partition.index(self._step(values))
             if index.size != self.samples * block.lanes:
                 index = np.ascontiguousarray(np.broadcast_to(index, shape))
-        return self._samples_together(index.reshape(shape))
+        return self._samples_together(self._admitted_only(values, index.reshape(shape)))
 
     def places(self, block: Block) -> Floats:
         """Return where samples end: images not wrapped, or places on the way, (d, samples)."""
@@ -187,6 +194,18 @@ class Sampler:
         if self._entries is not None:
             return self._entries.ends(values, self._step, shape, self.guard, places=True).place
         return np.stack([np.broadcast_to(x, shape).ravel() for x in self._step(values)])
+
+    def admits(self, values: Mapping[str, Floats]) -> Bools | None:
+        """Return where the condition of admissible pairs holds; None without one."""
+        if self._admitted is None:
+            return None
+        holds: Bools = self._admitted(values, self.guard)[0] != 0
+        return holds
+
+    def _admitted_only(self, values: Mapping[str, Floats], index: Floats) -> Floats:
+        """Let samples leave where the condition of admissible pairs does not hold."""
+        admitted = self.admits(values)
+        return index if admitted is None else np.where(admitted, index, np.nan)
 
     def costs(self, block: Block, values: Mapping[str, Floats]) -> Floats:
         """Return the mean costs, NaN where that of a sample is negative or not finite.
