@@ -15,6 +15,7 @@ from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid import conditions
+from lmdsl.model.grid.axis import AxisCells
 from lmdsl.model.grid.partition import Partition
 from lmdsl.problem.problem import Problem
 
@@ -167,3 +168,38 @@ _NO_CELL = {
     "boxes": "no cell lies inside the boxes; enlarge them",
     "where": "on no cell as a whole the condition certainly holds; widen it, use smaller cells",
 }
+
+
+MOST_BOXES = 3  # boxes of which is said what became of them
+
+
+def attractor_note(problem: Problem, partition: Partition) -> str:
+    """Return what became of attractor boxes that are no unions of cells, empty where all are.
+
+    A part of a cell that a box covers is not in the attractor.
+    """
+    notes = []
+    for i, box in enumerate(problem.attractor.boxes):
+        block = partition.inside_box(box, f"attractor.boxes[{i}]")
+        if not all(block):
+            notes.append(f"attractor.boxes[{i}] holds no cell")
+            continue
+        parts = [
+            part
+            for axis, name, cells in zip(partition.axes, partition.names, block, strict=True)
+            if (part := _asked(axis, name, cells, box.get(name, (axis.low, axis.high))))
+        ]
+        if parts:
+            notes.append(f"attractor.boxes[{i}] asked for {' and '.join(parts)}")
+    more = f"; and {len(notes) - MOST_BOXES} boxes more" if len(notes) > MOST_BOXES else ""
+    return "; ".join(notes[:MOST_BOXES]) + more
+
+
+def _asked(axis: AxisCells, name: str, cells: range, ends: tuple[float, float]) -> str:
+    """Return what was asked for on an axis and what it became, empty where it is the same."""
+    a, b = max(ends[0], axis.low), min(ends[1], axis.high)
+    first, last = (axis.low + k * axis.width for k in (cells.start, cells.stop))
+    if max(abs(a - first), abs(b - last)) <= 2 * axis.margin * axis.width:
+        return ""
+    got = f"[{first + 0.0:.6g}, {last + 0.0:.6g}], whole cells"
+    return f"{name} in [{a + 0.0:.6g}, {b + 0.0:.6g}], got {got}"

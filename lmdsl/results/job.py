@@ -15,6 +15,7 @@ from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
 from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.sets import attractor_note
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.results.polishing import _Outcome
@@ -144,6 +145,7 @@ class _Job:
         solved = status != Status.NOT_STABILIZABLE
         attractor = lp.cell_status == CellStatus.ATTRACTOR
         local = LocalController.of(lp.problem, lp.partition, attractor)
+        note = attractor_note(lp.problem, lp.partition)
         return Result(
             status=status,
             backend=self.backend,
@@ -160,7 +162,7 @@ class _Job:
             stabilizable_cells=lp.n,
             local_controller=None if local is None else examine(lp.problem, local, self.finish),
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
-            message=message,
+            message=f"{message}; {note}" if note else message,
             problem=lp.problem,
             partition=lp.partition,
             certificate=proof,

@@ -65,7 +65,11 @@ def _blocks(problem: Problem, S: int) -> int:
     step, cost = problem.step(), problem.stage()
     d, samples, count = len(problem.state_box), max(chunk(problem), S), threads.count()
     # States, images and their cells, paths, the arrays of a formula, keys and rows.
-    live = max(step.live, cost.live if cost else 0)
+    condition = problem.admitted()
+    others = [cost] if cost else []
+    if condition is not None:
+        others.append(Program([condition], problem.system.constants()))
+    live = max(step.live, *(other.live for other in others)) if others else step.live
     each = 8 * samples * (3 * d + live + 8 + path_doubles(problem))
     waiting = 8 * (count - 1) * 16 * samples  # finished blocks, for their turn
     return count * each + waiting
@@ -102,6 +106,9 @@ def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
     calls = 2 + 2 * lanes * min(samples, CHUNK) // CHUNK
     locating = SAMPLE * (1 + path_doubles(problem) // 8)
     work = lanes * samples * (locating + step.work + cost.work)
+    condition = problem.admitted()
+    if condition is not None:
+        work += lanes * samples * Program([condition], problem.system.constants()).work
     work += CALL * calls * (step.effort + cost.effort)
     attractor, avoid, weight = problem.attractor, problem.avoid, problem.measure
     boxes = [attractor.boxes, (avoid and avoid.boxes) or (), (weight and weight.boxes) or ()]
