@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from lmdsl.model.stabilizable_set import CellStatus as CellStatus
     from lmdsl.optimize.feasibility.gamma_bar import GammaBar as GammaBar
     from lmdsl.optimize.feasibility.gamma_bar import gamma_max as gamma_max
+    from lmdsl.problem.from_matrices import from_matrices as from_matrices
     from lmdsl.problem.problem import Problem as Problem
     from lmdsl.problem.problem import load as load
     from lmdsl.results import exports as exports
@@ -64,6 +65,7 @@ _HOME = {
     "compare": "results.comparison",
     "compile": "model.lp",
     "explain": "explanation.causes",
+    "from_matrices": "problem.from_matrices",
     "gamma_max": "optimize.feasibility.gamma_bar",
     "load": "problem.problem",
     "solve": "results.solving",

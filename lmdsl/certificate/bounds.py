@@ -104,7 +104,7 @@ def exact_backup(
         (Fraction(float(x[j])) * share for j, share in lp.rows.exact(k) if j < n), Fraction(0)
     )
     fixed = Fraction(0) if cost is None else Fraction(float(cost[k]))
-    return Fraction(gamma) * total / lp.rows.shares.total + fixed
+    return Fraction(gamma) * total / lp.rows.total(k) + fixed
 
 
 def exactly_below(

@@ -2,26 +2,36 @@
 
 A double is an integer times a power of two and a transition is numerator / total, so each
 inequality becomes one between integers. Written for clarity: a few microseconds per transition.
+Rows may have denominators of their own; then, in the residual alone, what arrives in a cell is
+rounded upwards to a multiple of 2^-FINE: a sum over all denominators would have millions of digits.
 """
 
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 
 from lmdsl.common.types import Floats, Guard, Indices, Policy
 from lmdsl.model.lp import StabilizationLP
 
-Row = list[tuple[int, int]]
+
+class Row(NamedTuple):
+    """A row: (target in C, numerator) for each entry, and the denominator of all."""
+
+    entries: list[tuple[int, int]]
+    total: int
+
 
 BLOCK = 2**14  # number of rows that are read at a time
+FINE = 4_000  # the residual is rounded up to a multiple of 2^-FINE where totals differ
 
 
 def rows(
     lp: StabilizationLP, columns: Indices, guard: Guard | None = None
 ) -> Iterator[tuple[int, Row]]:
-    """Yield (column, [(target in C, numerator), ...]), block by block; ``guard`` may raise."""
-    numerator, n = lp.rows.shares.numerator, lp.n
+    """Yield (column, row), block by block; ``guard`` may raise."""
+    shares, n = lp.rows.shares, lp.n
     for i in range(0, len(columns), BLOCK):
         if guard is not None:
             guard()
@@ -29,7 +39,9 @@ def rows(
         taken = lp.rows.take(block)
         pointer, target, code = taken.pointer.tolist(), taken.target.tolist(), taken.code.tolist()
         for k, first, last in zip(block.tolist(), pointer[:-1], pointer[1:], strict=True):
-            yield k, [(target[e], numerator[code[e]]) for e in range(first, last) if target[e] < n]
+            numerator, total = shares.over(code[first:last])
+            row = zip(target[first:last], numerator, strict=True)
+            yield k, Row([(j, s) for j, s in row if j < n], total)
 
 
 def integers(x: list[Fraction]) -> tuple[list[int], int]:
@@ -41,15 +53,22 @@ def integers(x: list[Fraction]) -> tuple[list[int], int]:
 def residual(lp: StabilizationLP, rows: Iterable[Row], mu: list[Fraction]) -> Fraction:
     """Return ||m - mu + gamma P_u'mu||_1 for the rows of a policy."""
     a, shift = integers(mu)
-    inflow = [0] * lp.n
-    for i, row in enumerate(rows):
+    inflow: list[dict[int, int]] = [{} for _ in range(lp.n)]  # by denominator
+    for i, (row, total) in enumerate(rows):
         for j, s in row:
-            inflow[j] += a[i] * s
-    rate = Fraction(lp.gamma) / (lp.rows.shares.total * 2**shift)
-    weight = lp.weight.tolist()
-    return sum(
-        (abs(Fraction(weight[j]) - mu[j] + rate * inflow[j]) for j in range(lp.n)), Fraction(0)
-    )
+            inflow[j][total] = inflow[j].get(total, 0) + a[i] * s
+    left = _left(lp, inflow, mu, Fraction(lp.gamma) / 2**shift)
+    if lp.rows.shares.total is not None:
+        return sum(left, Fraction(0))
+    return Fraction(sum(-(-x.numerator * 2**FINE // x.denominator) for x in left), 2**FINE)
+
+
+def _left(
+    lp: StabilizationLP, inflow: list[dict[int, int]], mu: list[Fraction], rate: Fraction
+) -> Iterator[Fraction]:
+    for j, m in enumerate(lp.weight.tolist()):
+        arrives = sum((Fraction(x, total) for total, x in inflow[j].items()), Fraction(0))
+        yield abs(Fraction(m) - mu[j] + rate * arrives)
 
 
 def fractions(x: Floats) -> list[Fraction]:
@@ -63,20 +82,22 @@ def contraction(lp: StabilizationLP, rows: list[Row], w: list[Fraction]) -> Frac
         return None
     a, _ = integers(w)
     worst = max(
-        (Fraction(sum(a[j] * s for j, s in row), a[i]) for i, row in enumerate(rows)),
+        (
+            Fraction(sum(a[j] * s for j, s in row), a[i] * total)
+            for i, (row, total) in enumerate(rows)
+        ),
         default=Fraction(0),
     )
-    return Fraction(lp.growth) * worst / lp.rows.shares.total
+    return Fraction(lp.growth) * worst
 
 
 def above_policy(lp: StabilizationLP, rows: list[Row], policy: Policy, V: list[Fraction]) -> bool:
     """Decide V >= gamma P_u V + G_u."""
     a, shift = integers(V)
-    scale, total = Fraction(lp.gamma), lp.rows.shares.total
-    cost = lp.cost[policy].tolist()
+    scale, cost = Fraction(lp.gamma), lp.cost[policy].tolist()
     return all(
         a[i] >= scale * sum(a[j] * s for j, s in row) / total + Fraction(cost[i]) * 2**shift
-        for i, row in enumerate(rows)
+        for i, (row, total) in enumerate(rows)
     )
 
 
@@ -86,11 +107,9 @@ def below_all(
     """Decide x <= gamma P_a x + G_a for every surviving pair."""
     a, shift = integers(x)
     p, q = lp.gamma.as_integer_ratio()
-    total = lp.rows.shares.total
-    left = [value * q * total for value in a]
-    unit = q * total * 2**shift
-    for k, row in rows(lp, np.arange(lp.K, dtype=np.int64), guard):
-        lacking = left[lp.cell[k]] - p * sum(a[j] * s for j, s in row)
-        if lacking > 0 and (cost is None or lacking > Fraction(float(cost[k])) * unit):
+    left, unit = [value * q for value in a], q * 2**shift
+    for k, (row, total) in rows(lp, np.arange(lp.K, dtype=np.int64), guard):
+        lacking = left[lp.cell[k]] * total - p * sum(a[j] * s for j, s in row)
+        if lacking > 0 and (cost is None or lacking > Fraction(float(cost[k])) * (unit * total)):
             return False
     return True

@@ -146,11 +146,14 @@ def _summary(result: Any) -> str:
         ("pairs", f"{result.pairs} surviving, {result.controls} controls"),
         ("gamma", f"{result.gamma!r}"),
     ]  # fmt: skip
+    if result.problem.discount is not None:
+        rows.append(("discount", _discount(result)))
     if result.lp is None:  # there was no time to compile
         rows[3:6] = [("cells", str(result.cells)), ("controls", str(result.controls))]
     elif result.status != Status.NOT_STABILIZABLE:
         rows += [
             ("cost", f"{number(result.cost)} (lower bound {number(result.lower_bound)})"),
+            *([("reward", number(result.reward))] if result.reward is not None else []),
             ("gap", f"{number(result.gap, '.2g')} (tolerance {number(result.tolerance, '.2g')})"),
             ("contraction", number(result.contraction)),
             ("polish steps", str(result.polish_steps)),
@@ -165,6 +168,15 @@ def _summary(result: Any) -> str:
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {value}" for name, value in rows]
     return "\n".join([*lines, "", printable(result.message)])
+
+
+def _discount(result: Any) -> str:
+    text, ended = f"{result.problem.discount!r}", result.ended_by_discount
+    if result.problem.attractor.empty:
+        return f"{text}: discounted, no target"
+    if ended is None:
+        return text
+    return f"{text}: {100 * (1 - ended):.4g} % end in the attractor, {100 * ended:.4g} % before"
 
 
 def _others(result: Any) -> str:

@@ -79,6 +79,11 @@ Number = Annotated[float, Field(allow_inf_nan=False, strict=True), BeforeValidat
 # A finite double above 0.
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, strict=True), BeforeValidator(plain)]
 
+# A double above 0 and below 1.
+Fractional = Annotated[
+    float, Field(gt=0, lt=1, allow_inf_nan=False, strict=True), BeforeValidator(plain)
+]
+
 # A whole number of at least 1.
 Count = Annotated[int, Field(strict=True, ge=1, le=10**15), BeforeValidator(plain)]
 

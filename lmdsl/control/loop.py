@@ -18,6 +18,8 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.local_control import ConstantControl
 from lmdsl.problem.problem import Problem
+from lmdsl.systems import MatrixSystem
+from lmdsl.systems.matrices.system import Draws
 
 REACHED, LOST, CYCLING = 0, 1, 2
 
@@ -50,19 +52,29 @@ class Held:
 
 
 class ClosedLoop:
-    """The true map under a controller: wraps, clips and judges like the compiled model."""
+    """The true map under a controller: wraps, clips and judges like the compiled model.
+
+    Of a finite model the next states are drawn by its rows, and are the centres of their cells.
+    """
 
     def __init__(self, problem: Problem, controller: Controller, status: Statuses) -> None:
         self.problem, self.controller, self.status = problem, controller, status
         self.partition = controller.partition
         self.true_map = TrueMap(problem, self.partition)
         self.nodes = noise_nodes(problem)
+        system = problem.system
+        self.draws = Draws(system.rows) if isinstance(system, MatrixSystem) else None
         self.probability = self.nodes.weights / self.nodes.weights.sum()
 
     def step(
         self, x: Floats, cell: Indices, rng: np.random.Generator, deadline: Deadline = FOREVER
     ) -> tuple[Floats, Indices]:
         """Return the next states, shape (r, d), and their cells, -1 outside the box."""
+        if self.draws is not None:
+            deadline.raise_if_over("simulating")
+            index = self.controller.index[cell].astype(np.int64)
+            after = self.draws(cell, np.where(cell >= 0, index, -1), rng)
+            return self.partition.centres(np.maximum(after, 0)), after
         u = self.controller.at(cell, x)
         noise: list[Floats] = []
         if self.problem.noises:

@@ -36,6 +36,8 @@ class Simulation(Frozen):
         Steps that were made: fewer than the limit where every run ended, or the time was up.
     cut
         The time was up: the runs that had not ended count as cycling.
+    aimed
+        There is an attractor to reach; else going on for ever is no fault.
     """
 
     starts: int
@@ -47,16 +49,22 @@ class Simulation(Frozen):
     held: Held | None = None
     steps_made: int = 0
     cut: bool = False
+    aimed: bool = True
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         data = {**asdict(self), "interval": list(self.interval)}
+        del data["aimed"]
         if self.held is not None and self.held.distance is not None:
             data["held"]["distance"] = list(self.held.distance)
         return data
 
     def sentence(self) -> str:
         """Return what became of the runs, and what it means where many did not arrive."""
+        if not self.aimed:
+            few = ": too few samples, or too large cells" * (self.lost > FEW * self.starts)
+            steps, lost = f"{self.steps_made:,} steps", f"{self.lost:,} of {self.starts:,}"
+            return f"true map: discounted, no target; {lost} runs are lost in {steps}{few}"
         parts = [f"true map: {self.reached:,} of {self.starts:,} runs arrive"]
         parts += [f"{self.lost:,} {'is' if self.lost == 1 else 'are'} lost"] * bool(self.lost)
         parts += [f"{self.cycling:,} cycle{'s'[self.cycling != 1 :]}"] * bool(self.cycling)
@@ -78,6 +86,8 @@ class Simulation(Frozen):
             f"  lost                   {self.lost}",
             f"  cycling                {self.cycling}",
         ]
+        if not self.aimed:
+            lines[1:4] = [lines[2], f"  going on               {self.cycling}  (no target)"]
         if self.cut:
             lines[-1] += f"  (or cut off by the time limit after {self.steps_made} steps)"
         if self.steps:
@@ -152,6 +162,7 @@ def simulate(
         held=None if loop.controller.local is None else loop.hold(arrived, hold, rng, deadline),
         steps_made=made,
         cut=bool(cycling) and made < steps,
+        aimed=not loop.problem.attractor.empty,
     )
 
 

@@ -11,7 +11,7 @@ from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
 from lmdsl.common.types import Progress, Statuses
 from lmdsl.errors import BadInput, shown
-from lmdsl.explanation import one_cell
+from lmdsl.explanation import finite, one_cell
 from lmdsl.explanation.hints import Hint, hints
 from lmdsl.explanation.lost_mass import PhaseOne
 from lmdsl.explanation.one_cell import NAMES, Why
@@ -21,12 +21,14 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model import stabilizable_set
 from lmdsl.model.assembly.sampler import Sampler
 from lmdsl.model.assembly.transitions import Transitions, assemble
+from lmdsl.model.discretization import control_count
 from lmdsl.model.grid import boxes
 from lmdsl.model.grid.boxes import Area, Region
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.problem.problem import Problem
+from lmdsl.systems import MatrixSystem
 
 MEANING = {
     CellStatus.ESCAPES: "every control sends some sample out of the box, into avoid, or to "
@@ -120,10 +122,14 @@ class Explanation(Frozen):
         index = tuple(int(k) for k in np.unravel_index(i, p.shape))
         known: dict[str, Any] = {
             "cell": i, "index": index, "box": boxes.of_cell(p, i), "cause": NAMES[status],
-            "controls": len(self.sampler.controls),
+            "controls": control_count(self.problem),
         }  # fmt: skip
         if status in (CellStatus.ESCAPES, CellStatus.LEADS_TO_THESE):
-            return Why(moves=one_cell.moves(self.sampler, self.cell_status, i), **known)
+            if isinstance(self.problem.system, MatrixSystem):
+                moves = finite.moves(self.problem, self.partition, self.cell_status, i)
+            else:
+                moves = one_cell.moves(self.sampler, self.cell_status, i)
+            return Why(moves=moves, **known)
         if status != CellStatus.TRAPPED:
             return Why(**known)
         free = self.transitions.sets.free
@@ -250,7 +256,7 @@ def explain(
     else:
         partition = Partition.of(problem)
         assembled = assemble(problem, partition, progress, deadline)
-        status = _status(assembled, deadline)
+        status = _status(problem, assembled, deadline)
     if phase_one and assembled is None:
         assembled = assemble(problem, partition, progress, deadline)
     if progress:
@@ -265,7 +271,8 @@ def explain(
         solved = PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
     helpful: tuple[Hint, ...] = ()
     with suppress(TimeLimitReached):
-        helpful = hints(Sampler(problem, partition, deadline, "trying what helps"), status)
+        if not isinstance(problem.system, MatrixSystem):  # there is no map to try it with
+            helpful = hints(Sampler(problem, partition, deadline, "trying what helps"), status)
     return Explanation(problem, partition, status, tuple(found), helpful, solved, assembled)
 
 
@@ -288,13 +295,13 @@ def phase_one(problem: Problem, time_limit: float | Deadline | None = None) -> P
     """
     partition, deadline = Partition.of(problem), Deadline.of(time_limit)
     assembled = assemble(problem, partition, deadline=deadline)
-    status = _status(assembled, deadline)
+    status = _status(problem, assembled, deadline)
     return PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
 
 
-def _status(transitions: Transitions, deadline: Deadline) -> Statuses:
+def _status(problem: Problem, transitions: Transitions, deadline: Deadline) -> Statuses:
     """Return the status of every cell, shape (N,)."""
-    found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
+    found = stabilizable_set.of_problem(problem, transitions, deadline)
     status = stabilizable_set.statuses(transitions, found)
     status.setflags(write=False)
     return status

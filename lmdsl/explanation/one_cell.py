@@ -34,7 +34,9 @@ class Move(Frozen):
         The control, by name.
     kind
         ``leaves`` the box, enters ``avoid``, is ``not finite``, is ``not admissible`` (the
-        condition of the problem does not hold), or ``enters`` a cell that is not stabilizable.
+        condition of the problem does not hold), or ``enters`` a cell that is not stabilizable; in a
+        finite model also ``missing``, the control is not available, and ``escapes``, the row sums
+        to less than 1.
     state, noise, image
         The first sample that does so, and where it lands, or is judged on the way; noise is empty
         without noise.
@@ -44,6 +46,8 @@ class Move(Frozen):
         Of ``enters``: the cell entered, and why it is not stabilizable.
     share
         The share of the cell's samples that leave, or if none leaves, that enter such cells.
+    given
+        The rows were given, not sampled.
     """
 
     control: Named
@@ -55,6 +59,7 @@ class Move(Frozen):
     sides: tuple[tuple[str, str, float], ...] = ()
     cell: int | None = None
     cause: str | None = None
+    given: bool = False
 
     def __str__(self) -> str:
         control = _shown(self.control)
@@ -65,8 +70,12 @@ class Move(Frozen):
                 f"the condition does not hold at {at}"
             )
         start = f"{control} loses" if control else "it loses"
+        if self.kind == "missing":
+            return f"{control} is not available"
+        if self.kind == "escapes":
+            return f"{start} {100 * self.share:.3g} %: its row sums to so much less than 1"
         sample = (
-            f"{start} {100 * self.share:.3g} % of the samples: "
+            f"{start} {100 * self.share:.3g} %{'' if self.given else ' of the samples'}: "
             f"{_shown({**self.state, **self.noise})} goes to {_shown(self.image)}"
         )
         if self.kind == "leaves":

@@ -223,7 +223,9 @@ class StabilizationLP(Frozen):
     def digest(self) -> str:
         """SHA-256 of the compiled model: statuses, pairs, exact transitions, costs, gamma, m."""
         sha = hashlib.sha256(b"lmdsl model 1\n")
-        sha.update(repr((self.rows.shares.total, [*self.rows.shares.numerator])).encode())
+        shares = self.rows.shares
+        below = [*shares.denominator] if shares.total is None else shares.total
+        sha.update(repr((below, [*shares.numerator])).encode())
         sha.update(np.array([self.gamma], dtype="<f8").tobytes())
         for array, kind in (
             (self.cell_status, "<u1"), (self.pair_pointer, "<i8"), (self.control, "<i4"),
@@ -291,7 +293,7 @@ def compile(  # noqa: A001
         LocalController.of(problem, partition, attractor, limit)
     transitions = assemble(problem, partition, progress, deadline)
     sets = transitions.sets
-    found = stabilizable_set.stabilizable(transitions.pair_pointer, transitions.rows, deadline)
+    found = stabilizable_set.of_problem(problem, transitions, deadline)
     kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
     cells = sets.free[found.inside]
     # The search that found C ends with Algorithm 1 on the surviving pairs.

@@ -4,13 +4,17 @@ A row is a list of (target, code). The code stands for the share of the samples 
 target: ``share[code]`` as a double, ``numerator[code] / total`` exactly. Without noise code
 ``c - 1`` stands for ``c`` of the S samples. With noise, samples are counted apart for each group
 of nodes of equal weight; a target may then occur several times in a row, and no rounding enters.
+Rows that are given and not counted have no denominator in common: each code has its own.
 
 The last target, ``columns``, is the attractor: a vector multiplied with the rows has one more
-entry, 0 there. Every row sums to exactly 1 with it.
+entry, 0 there. With a discount the end of the run is the same target, by a code of its own. Every
+row sums to exactly 1 with it.
 """
 
+import itertools
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, NamedTuple, Self
 
@@ -32,9 +36,13 @@ class Shares(Frozen):
     """What the codes of a set of rows stand for."""
 
     numerator: Sequence[int]  # exact integers, one per code
-    total: int  # exact integer; ``numerator[code] / total`` is the exact share
+    # exact integer; ``numerator[code] / total`` is the exact share. None: see denominator
+    total: int | None
     value: Floats  # the same as doubles, shape (codes,), each correctly rounded
-    merged: bool = False  # every target occurs at most once in a row
+    merged: bool = False  # every target but the attractor occurs at most once in a row
+    denominator: Sequence[int] = ()  # one per code where they have no total in common
+    # code of the share with which a run ends, the last entry of every row; None: no discount
+    ended: int | None = None
 
     @classmethod
     def of(cls, points: int, nodes: Nodes) -> Self:
@@ -55,6 +63,31 @@ class Shares(Frozen):
             total=int(total * scale),
             value=np.array([float(f / total) for f in exact]),
         )
+
+    def discounted(self, b: float) -> "Shares":
+        """Return b times the shares, and as the last code 1 - b: the share of runs that end."""
+        p, q = b.as_integer_ratio()
+        numerator = [n * p for n in self.numerator]
+        last = (q - p) * (1 if self.total is None else self.total)
+        total = None if self.total is None else self.total * q
+        denominator = [] if self.total is not None else [*(d * q for d in self.denominator), q]
+        below = denominator if total is None else itertools.repeat(total)
+        numerator.append(last)
+        return replace(
+            self,
+            numerator=tuple(numerator),
+            total=total,
+            value=np.array([n / d for n, d in zip(numerator, below, strict=False)]),
+            denominator=tuple(denominator),
+            ended=len(self.numerator),
+        )
+
+    def over(self, codes: Sequence[int]) -> tuple[list[int], int]:
+        """Return the shares of some codes as numerators of one denominator."""
+        if self.total is not None:
+            return [self.numerator[c] for c in codes], self.total
+        total = math.lcm(*{self.denominator[c] for c in codes})
+        return [self.numerator[c] * (total // self.denominator[c]) for c in codes], total
 
 
 class RowArrays(NamedTuple):
@@ -105,12 +138,26 @@ class Rows(Frozen):
         return RowArrays(pointer, target, self.code, self.shares.value)
 
     def exact(self, k: int) -> list[tuple[int, int]]:
-        """Return row k as (target, numerator); the numerators sum to ``shares.total``."""
+        """Return row k as (target, numerator); the numerators sum to ``total(k)``."""
         span = slice(self.pointer[k], self.pointer[k + 1])
-        return [
-            (int(j), self.shares.numerator[int(c)])
-            for j, c in zip(self.target[span], self.code[span], strict=True)
-        ]
+        numerators, _ = self.shares.over(self.code[span].tolist())
+        return list(zip(self.target[span].tolist(), numerators, strict=True))
+
+    def total(self, k: int) -> int:
+        """Return the denominator of row k."""
+        if self.shares.total is not None:
+            return self.shares.total
+        return self.shares.over(self.code[self.pointer[k] : self.pointer[k + 1]].tolist())[1]
+
+    def without_end(self) -> "Rows":
+        """Return the pattern of the rows as if no run ended by discount."""
+        if self.shares.ended is None:
+            return self
+        kept = self.code != self.shares.ended
+        before = np.concatenate([[0], np.cumsum(kept)])
+        return replace(
+            self, pointer=before[self.pointer], target=self.target[kept], code=self.code[kept]
+        )
 
     def take(self, rows: NDArray[np.integer]) -> "Rows":
         """Return some of the rows, in the given order."""
@@ -144,6 +191,14 @@ class Rows(Frozen):
         if not self.shares.merged:
             matrix.sum_duplicates()
         return matrix
+
+
+def append_end(
+    end: Indices, target: NDArray[np.int32], code: NDArray[Any], columns: int, ended: int
+) -> tuple[Indices, NDArray[np.int32], NDArray[Any]]:
+    """Return rows, given by their ends, with the end of the run by discount as last entries."""
+    longer = end + np.arange(1, len(end) + 1)
+    return longer, np.insert(target, end, np.int32(columns)), np.insert(code, end, ended)
 
 
 def over_rows(count: int, loop: Callable[..., object], *arguments: Any) -> None:

@@ -158,7 +158,7 @@ def _attractor(problem: Problem, partition: Partition, guard: Guard) -> Bools:
                 )
     mask = partition.mask(itertools.chain(points, boxes, cells), guard)  # one at a time
     mask |= _conditions(problem, "attractor", partition, guard)
-    if not mask.any():
+    if not (mask.any() or declared.empty):
         key = "where" if declared.where and not declared.boxes else "boxes"
         raise BadInput(f"{_NO_CELL[key]} or give points", "attractor")
     return mask

@@ -29,6 +29,7 @@ from lmdsl.machine.kernels import kernel
 from lmdsl.model.algorithm_1 import Predecessors, owner, tree
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.rows import Rows
+from lmdsl.problem.problem import Problem
 
 
 class CellStatus(IntEnum):
@@ -80,6 +81,19 @@ def stabilizable(
         before = before or Predecessors.of(rows)
         cell = owner(pair_pointer)
         _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)
+
+
+def of_problem(
+    problem: Problem, transitions: Transitions, deadline: Deadline | None = None
+) -> Stabilizable:
+    """Return the stabilizable set of a problem's transitions.
+
+    With a discount b a run that ends counts as one that reached A, as long as gamma b < 1: then
+    staying for ever costs a finite amount, and C is the greatest set that can be kept. Where
+    gamma b >= 1 it does not, and A has to be reached as without a discount.
+    """
+    rows = transitions.rows if problem.ends_in_time else transitions.rows.without_end()
+    return stabilizable(transitions.pair_pointer, rows, deadline)
 
 
 def statuses(transitions: Transitions, found: Stabilizable) -> Statuses:

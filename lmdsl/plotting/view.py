@@ -46,7 +46,10 @@ class View:
         axes: Sequence[str] | None = None,
         at: Mapping[str, float] | None = None,
     ) -> Self:
-        """Resolve a choice of axes; the default slice passes through the attractor's centre."""
+        """Resolve a choice of axes; the default slice passes through the attractor's centre.
+
+        Without an attractor it passes through the middle of the box.
+        """
         names, at = partition.names, {} if at is None else at
         inputs.kind(at, Mapping, "at", "a mapping; write {axis: value}")
         if axes is not None:
@@ -62,6 +65,8 @@ class View:
         if set(at) & set(chosen):
             raise BadInput(f"{shown(list(at))}: only axes that are not shown are held", "at")
         cells = np.flatnonzero(attractor)
+        if not len(cells):
+            cells = np.ravel_multi_index([[k // 2] for k in partition.shape], partition.shape)
         centres = partition.centres(cells)
         distance = np.abs((centres - centres.mean(axis=0)) / partition.width).sum(axis=1)
         point = centres[np.argmin(distance)].copy()

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from lmdsl.common import spelling
 from lmdsl.errors import BadInput, shown
+from lmdsl.problem import endings
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
 from lmdsl.systems import OdeSystem
 from lmdsl.systems.named import NamedOde
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
 def require_consistent(problem: "Problem") -> None:
     """Refuse a problem whose names stand twice or nowhere; its formulas are parsed elsewhere."""
     _unique_names(problem)
+    endings.require_fit(problem)
+    endings.require_end(problem)
     _one_cost(problem)
     _sets_named(problem)
     _local_named(problem)

@@ -13,20 +13,21 @@ from pydantic import Field, model_validator
 
 from lmdsl.common import inputs
 from lmdsl.common.files import read_json, write_whole
-from lmdsl.common.strict_model import Declared, FileSchema, Positive
+from lmdsl.common.strict_model import Declared, FileSchema, Fractional, Positive
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.language import Definitions, Formula, defined, parse, parse_condition
 from lmdsl.formulas.names import FormulaText, Let
 from lmdsl.formulas.program import Program
+from lmdsl.problem import endings
 from lmdsl.problem.axes import StateBox
 from lmdsl.problem.consistency import require_consistent
 from lmdsl.problem.controls import ControlGrid
 from lmdsl.problem.local_control import LocalUnion
 from lmdsl.problem.noise import Noise
 from lmdsl.problem.sampling import SamplingUnion
-from lmdsl.problem.sets import Attractor, Avoid, Measure
+from lmdsl.problem.sets import REACHED_OR_ENDED, Attractor, Avoid, Measure
 from lmdsl.problem.unions import SystemUnion
-from lmdsl.systems import FunctionSystem, System
+from lmdsl.systems import FunctionSystem, MatrixSystem, System
 from lmdsl.systems.base import Judged, StateMap
 from lmdsl.systems.runge_kutta import RungeKutta
 
@@ -58,6 +59,8 @@ class Problem(Declared):
         Sample points within a cell for Ulam's method.
     gamma
         Geometric weight of the cost, sum of gamma^n G(x_n, u_n).
+    discount
+        b in (0, 1): after each step, once its cost is paid, the run ends with probability 1 - b.
     local_controller
         Feedback on the attractor cells, where the controller of the LP says nothing.
     noise, avoid, measure, on_exit, name
@@ -84,6 +87,7 @@ class Problem(Declared):
     terminal_cost: FormulaText | None = None
     sampling: SamplingUnion
     gamma: Positive = 1.0
+    discount: Fractional | None = None
     on_exit: Literal["forbid", "clip"] = "forbid"
     measure: Measure | None = None
     local_controller: LocalUnion | None = None
@@ -121,9 +125,10 @@ class Problem(Declared):
     def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
         """Allow the key that editors need, which no problem keeps."""
         schema = super().__get_pydantic_json_schema__(core, handler)
-        resolved = handler.resolve_ref_schema(schema)
-        resolved["properties"]["$schema"] = {"type": "string"}
-        resolved["oneOf"] = [{"required": [key]} for key in ("stage_cost", "cost_rate")]
+        whole = handler.resolve_ref_schema(schema)
+        whole["properties"]["$schema"] = {"type": "string"}
+        whole["oneOf"] = [{"required": [key]} for key in ("stage_cost", "cost_rate")]
+        whole["allOf"] = [REACHED_OR_ENDED]
         return schema
 
     @property
@@ -140,6 +145,11 @@ class Problem(Declared):
     def noises(self) -> tuple[str, ...]:
         """Names of the noise variables."""
         return tuple(self.noise or ())
+
+    @property
+    def ends_in_time(self) -> bool:
+        """Whether gamma times the discount is below 1: then no run costs more than a finite sum."""
+        return self.discount is not None and endings.rate(self) < 1
 
     def step(self) -> StateMap:
         """Return the map of the system, from named arrays to images."""
@@ -254,6 +264,8 @@ class Problem(Declared):
         """Return the problem as plain data that ``json.dumps`` accepts, defaults written out."""
         if isinstance(self.system, FunctionSystem):
             raise BadInput("a FunctionSystem cannot be written to a file; use formulas", "system")
+        if isinstance(self.system, MatrixSystem):
+            raise BadInput("a file holds no matrices; save the result of solving it", "system")
         data = self.model_dump(mode="json", exclude_none=True)
         for key in ("system", "sampling", "local_controller"):
             if key not in data:

@@ -53,25 +53,27 @@ class Attractor(Declared):
         A condition in the states, or several: the cells on all of which one certainly holds.
     """
 
-    model_config = ConfigDict(
-        json_schema_extra={
-            "anyOf": [
-                {"required": [key], "properties": {key: {"not": {"type": "array", "maxItems": 0}}}}
-                for key in ("points", "boxes", "cells", "where")
-            ]
-        }
-    )
-
     points: Points = ()
     boxes: Boxes = ()
     cells: CellIndices = ()
     where: Conditions | None = None
 
-    @model_validator(mode="after")
-    def _something(self) -> Self:
-        if not (self.points or self.boxes or self.cells or self.where is not None):
-            raise BadInput("no attractor cell; give points, boxes, cells or where")
-        return self
+    @property
+    def empty(self) -> bool:
+        """Whether nothing is declared, which only a problem with a discount may do."""
+        return not (self.points or self.boxes or self.cells or self.where is not None)
+
+
+_SOME_ATTRACTOR = {
+    "anyOf": [
+        {"required": [key], "properties": {key: {"not": {"type": "array", "maxItems": 0}}}}
+        for key in ("points", "boxes", "cells", "where")
+    ]
+}
+# The words of a JSON Schema for a problem with an attractor, or with a discount.
+REACHED_OR_ENDED = {
+    "anyOf": [{"required": ["discount"]}, {"properties": {"attractor": _SOME_ATTRACTOR}}]
+}
 
 
 class Avoid(Declared):

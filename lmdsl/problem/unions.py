@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Discriminator, Tag
 
 from lmdsl.common.strict_model import Declared, SchemaWords
 from lmdsl.errors import BadInput
-from lmdsl.systems import NAMED, FunctionSystem, MapSystem, OdeSystem, System
+from lmdsl.systems import NAMED, FunctionSystem, MapSystem, MatrixSystem, OdeSystem, System
 
 
 class EachWords(SchemaWords):
@@ -61,7 +61,8 @@ class _KindsOfFiles:
 
 def _is_function(schema: dict[str, Any]) -> bool:
     """Return whether a schema, or what it refers to and may not be made yet, is a function's."""
-    return schema == {"not": {}} or FunctionSystem.__name__ in schema.get("$ref", "")
+    names = (FunctionSystem.__name__, MatrixSystem.__name__)
+    return schema == {"not": {}} or any(name in schema.get("$ref", "") for name in names)
 
 
 def _refuse_functions(value: Any) -> Any:
@@ -70,6 +71,10 @@ def _refuse_functions(value: Any) -> Any:
             "kind 'function' cannot be declared as data; build a FunctionSystem in Python, "
             "or write formulas with kind 'map' or 'ode'"
         )
+    if isinstance(value, Mapping) and value.get("kind") == "matrices":
+        raise BadInput(
+            "kind 'matrices' cannot be declared as data; use lmdsl.from_matrices in Python"
+        )
     return value
 
 
@@ -77,7 +82,7 @@ if TYPE_CHECKING:
     SystemUnion = System
 else:
     SystemUnion = Annotated[
-        kinds(MapSystem, OdeSystem, *NAMED.values(), FunctionSystem),
+        kinds(MapSystem, OdeSystem, *NAMED.values(), FunctionSystem, MatrixSystem),
         BeforeValidator(_refuse_functions),
         _KindsOfFiles(),
     ]

@@ -106,10 +106,8 @@ class _Job:
         proof = verified.certificate
         if proof.verified:
             status = Status.VERIFIED
-            free = Coverage.of(self.lp.cell_status).free
             message = (
-                f"the controller brings every one of {self.lp.n} cells (of {free} free) to the "
-                f"attractor; its cost is within {proof.gap:.2g} of optimal (finite model)"
+                f"{self._success()}; its cost is within {proof.gap:.2g} of optimal (finite model)"
             )
         else:
             failed = not solution.stop.success and not undecided
@@ -133,6 +131,16 @@ class _Job:
             iterations=solution.iterations,
             log=self.log,
         )
+
+    def _success(self) -> str:
+        """Return what a verified controller does."""
+        lp, free = self.lp, Coverage.of(self.lp.cell_status).free
+        cells = f"every one of {lp.n} cells (of {free} free)"
+        if lp.problem.attractor.empty:
+            return f"discounted, no target: the controller keeps {cells} among them"
+        if lp.problem.ends_in_time:
+            return f"the controller runs from {cells} to the attractor or the discounted end"
+        return f"the controller brings {cells} to the attractor"
 
     def _result(
         self, witness: Witness, proof: Certificate, status: Status, message: str, **more: Any

@@ -30,6 +30,7 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Coverage, Summary
+from lmdsl.systems import MatrixSystem
 from lmdsl.systems.named import NotStored
 
 if TYPE_CHECKING:
@@ -123,6 +124,43 @@ class Result(Summary):
     def coverage(self) -> Coverage | None:
         """How much of what is neither attractor nor avoided is stabilizable; None if unknown."""
         return None if self.attractor_cells is None else Coverage.of(self.cell_status)
+
+    @property
+    def reward(self) -> float | None:
+        """The mean reward by m that the policy earns at least; None where costs are minimised."""
+        missed = self._missed
+        return None if missed is None or self.cost is None else missed - self.cost
+
+    @property
+    def rewards(self) -> Floats | None:
+        """What the policy earns at least from each cell, shape (N,): 0 on A, minus infinity off C.
+
+        None where costs are minimised.
+        """
+        missed = self._missed
+        if missed is None:
+            return None
+        attractor = self.cell_status == CellStatus.ATTRACTOR
+        return np.where(attractor, 0.0, missed - self.value)
+
+    @property
+    def _missed(self) -> float | None:
+        system = self.problem.system
+        if not isinstance(system, MatrixSystem) or system.best_reward is None:
+            return None
+        return system.missed(self.problem.gamma, self.problem.discount)
+
+    @property
+    def ended_by_discount(self) -> float | None:
+        """The share of runs that the discount ends before they reach A; None unless gamma is 1.
+
+        It is (1 - b) sum(mu): the Lyapunov measure counts the visits of each cell, and every visit
+        is the last one with probability 1 - b.
+        """
+        b = self.problem.discount
+        if b is None or self.gamma != 1 or not self.certificate.measure:
+            return None
+        return min(1.0, (1 - b) * math.fsum(self.measure))
 
     @cached_property
     def controller(self) -> Controller:

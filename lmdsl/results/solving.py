@@ -208,6 +208,8 @@ def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[Cause, st
     if not lp.n:
         if not np.isin(lp.cell_status, LOST).any():
             return Cause.EMPTY, "every cell is attractor or avoid; there is nothing to stabilize"
+        if lp.problem.attractor.empty:
+            return Cause.EMPTY, _nothing_to_end_in(lp.problem)
         return Cause.EMPTY, "no cell can be kept in the box and brought to the attractor"
     if not lp.weight.any():
         return Cause.MEASURE, "no cell of measure is stabilizable; enlarge its boxes"
@@ -219,6 +221,15 @@ def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[Cause, st
             f"{outside} of {lp.n + outside} cells outside A and Z are not stabilizable",
         )
     return None
+
+
+def _nothing_to_end_in(problem: Problem) -> str:
+    if problem.ends_in_time:
+        return "discounted, no target: no cell can be kept in the box"
+    return (
+        f"gamma = {problem.gamma!r} times the discount {problem.discount!r} is not below 1, and "
+        "there is no attractor: lower one of them, or declare an attractor"
+    )
 
 
 def _refuse(lp: StabilizationLP, found: first_policy.Refused, tolerance: float) -> Verified:

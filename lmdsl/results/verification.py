@@ -22,9 +22,10 @@ from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.assembly.estimates import estimate
+from lmdsl.model.assembly.transitions import shares_of
 from lmdsl.model.discretization import noise_nodes, sample_points
 from lmdsl.model.lp import StabilizationLP, compile
-from lmdsl.model.rows import Rows, Shares
+from lmdsl.model.rows import Rows
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
@@ -248,12 +249,12 @@ def _stored_model(path: str | os.PathLike[str], result: Result) -> Stabilization
         },
     )
     entries = int(small["pointer"][-1])
-    if not 0 <= entries <= K * points * len(nodes.weights):
+    if not 0 <= entries <= K * (points * len(nodes.weights) + 1):
         raise BadInput("pointer is out of range", "model.npz")
     large = archive.read_model(
         path, result, {"target": ((entries,), "<i4"), "code": ((entries,), "<u4")}
     )
-    shares = Shares.of(points, nodes)
+    shares = shares_of(problem, points, nodes)
     rows = Rows(
         small["pointer"],
         large["target"],
@@ -286,7 +287,7 @@ def _refuse_broken(rows: Rows, small: dict[str, Any], controls: int) -> None:
     if not sound:
         raise BadInput("the saved rows are inconsistent", "model.npz")
     for k in range(rows.count):
-        if sum(share for _, share in rows.exact(k)) != rows.shares.total:
+        if sum(share for _, share in rows.exact(k)) != rows.total(k):
             raise BadInput(f"row {k} does not sum to 1", "model.npz")
 
 

@@ -96,6 +96,12 @@ BAD = [
     ("named parameter", changed("system", value={"kind": "standard_map",
                                                  "parameters": {"k": 1}}), "system.parameters",
      "K"),
+    ("discount one", changed("discount", value=1), "discount", "less than 1"),
+    ("discount zero", changed("discount", value=0), "discount", "greater than 0"),
+    ("discount string", changed("discount", value="0.9"), "discount", "'0.9'"),
+    ("local controller of no attractor",
+     changed("attractor", value={}, base=steps(discount=0.5, local_controller={
+         "kind": "constant", "control": {"u": 0}})), "local_controller", "no attractor cell"),
     ("empty attractor", changed("attractor", value={}), "attractor", "no attractor cell"),
     ("attractor cell outside", changed("attractor", "cells", value=[[4]]), "attractor.cells[0]",
      "0..3"),

@@ -432,7 +432,8 @@ def step_function(
                 a.wrapped(x) if a.periodic else min(max(x, a.low), a.high) if clip else x
                 for a, x in zip(axes, place, strict=False)
             ]
-            cost += problem.get("gamma", 1.0) * terminal(dict(zip(states, state, strict=True)))
+            later = problem.get("gamma", 1.0) * problem.get("discount", 1.0)
+            cost += later * terminal(dict(zip(states, state, strict=True)))
         return key, cost
 
     return step
@@ -479,14 +480,21 @@ class ReferenceModel:
     avoid: set[int]
     # pair -> {target cell, "absorbed" or "escaped": number of sample points for each noise node}
     counts: dict[Pair, dict[int | str, list[int]]]
-    # pair -> ({target cell outside A: share}, share absorbed, share escaped), exact, sum 1
+    # pair -> ({target cell outside A: share}, share absorbed, share escaped), exact, sum 1; with a
+    # discount b the sum is b, and with the rest the run ends
     rows: dict[Pair, Row]
     admissible: set[Pair]
     cost: dict[Pair, float]  # of every admissible pair
     cell_status: list[int] = field(default_factory=list)
     surviving: list[Pair] = field(default_factory=list)
     m: dict[int, float] = field(default_factory=dict)
+    discount: Fraction = Fraction(1)
     _gamma_bar: Any = None
+
+    @property
+    def ends(self) -> bool:
+        """Whether every run ends by discount so soon that its cost is finite."""
+        return self.discount < 1 and Fraction(self.problem.get("gamma", 1.0)) * self.discount < 1
 
     @property
     def C(self) -> list[int]:
@@ -500,7 +508,7 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
     offsets = sample_offsets(problem)
     noise = noise_nodes(problem)
     A, Z = attractor_cells(problem), avoid_cells(problem)
-    if not A or A & Z:
+    if A & Z or not (A or ("discount" in problem and not problem["attractor"])):
         raise ValueError("no attractor cell, or a cell that is both attractor and avoid")
     step = step_function(problem, axes, A, Z)
     admissible = value_of(problem, problem.get("admissible", "0 == 0"))
@@ -521,6 +529,7 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
         rows={},
         admissible=set(),
         cost={},
+        discount=Fraction(float(problem.get("discount", 1))),
     )
     for cell in range(N):
         if cell in A or cell in Z:
@@ -542,7 +551,8 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
                     count.setdefault(key, [0] * len(noise))[node] += 1
                     costs.append(cost)
             model.counts[pair] = count
-            model.rows[pair] = _shares(count, [w for _, w in noise], len(offsets))
+            row = _shares(count, [w for _, w in noise], len(offsets))
+            model.rows[pair] = _discounted(row, model.discount)
             if "escaped" not in count:
                 model.admissible.add(pair)
                 model.cost[pair] = _mean_cost(model, pair, costs)
@@ -570,6 +580,11 @@ def _shares(count: dict, weights: list[float], points: int) -> Row:
     return share, absorbed, escaped
 
 
+def _discounted(row: Row, b: Fraction) -> Row:
+    targets, absorbed, escaped = row
+    return {t: b * share for t, share in targets.items()}, b * absorbed, b * escaped
+
+
 def _mean_cost(model: ReferenceModel, pair: Pair, costs: list[float]) -> float:
     """Weighted mean of the costs of the samples, by sample point, then noise node."""
     for g in costs:
@@ -581,8 +596,13 @@ def _mean_cost(model: ReferenceModel, pair: Pair, costs: list[float]) -> float:
 
 
 def _can_reach(model: ReferenceModel, pairs: Iterable[Pair]) -> set[int]:
-    """Cells from which A is reached with positive probability through the given pairs."""
+    """Cells from which A is reached with positive probability through the given pairs.
+
+    Where runs end by discount in time, their end is as good as A.
+    """
     pairs = list(pairs)
+    if model.ends:
+        return {cell for cell, _ in pairs}
     reached: set[int] = set()
     while True:
         more = {
@@ -770,7 +790,8 @@ def tree_policy(arrays: _Arrays) -> list[int]:
             if i in chosen:
                 continue
             for k in choices:
-                if _reaches_in_one(arrays.model.rows[arrays.pairs[k]], reached):
+                row = arrays.model.rows[arrays.pairs[k]]
+                if arrays.model.ends or _reaches_in_one(row, reached):
                     level[i] = k
                     break
         chosen |= level

@@ -19,20 +19,24 @@ def compare(data):
     assert lp.cell_status.tolist() == list(expected.cell_status)
     columns = list(zip(lp.cells[lp.cell].tolist(), lp.control.tolist(), strict=True))
     assert columns == sorted(expected.surviving)
-    total = lp.rows.shares.total
     for k, pair in enumerate(columns):
         assert lp.column(*pair) == k
         row: dict[int, Fraction] = {}
-        absorbed = Fraction(0)
-        for j, share in lp.rows.exact(k):
-            if j == lp.n:
+        absorbed = ended = Fraction(0)
+        total, codes = lp.rows.total(k), lp.rows.code[slice(*lp.rows.pointer[k : k + 2])]
+        for (j, share), code in zip(lp.rows.exact(k), codes, strict=True):
+            if code == lp.rows.shares.ended:
+                assert (j, ended) == (lp.n, 0)
+                ended = Fraction(share, total)
+            elif j == lp.n:
                 absorbed += Fraction(share, total)
             else:
                 cell = int(lp.cells[j])
                 row[cell] = row.get(cell, Fraction(0)) + Fraction(share, total)
         targets, reference_absorbed, escaped = expected.rows[pair]
         assert escaped == 0
-        assert sum(row.values()) + absorbed == 1
+        assert ended == 1 - expected.discount
+        assert sum(row.values()) + absorbed + ended == 1
         if not data.get("noise"):
             assert row == targets
             assert absorbed == reference_absorbed
@@ -55,7 +59,7 @@ def _compare_solution(data, expected, lp):
     if known.status == "not_stabilizable":
         assert result.status == "not_stabilizable", result.message
         return
-    if data.get("gamma", 1) >= 1 or known.policy_reaches:
+    if data.get("gamma", 1) >= 1 or known.policy_reaches or expected.ends:
         assert result.status == "verified", result.message
     elif not known.tied_policy_reaches:
         assert result.status == "unverified", result.message
@@ -82,6 +86,25 @@ def test_corner_cases(case):
 def test_random_problems(block):
     for i in range(12):
         data = random_problem(np.random.default_rng([block, i]))
+        try:
+            compare(data)
+        except AssertionError as error:
+            raise AssertionError(f"block {block}, problem {i}: {data}") from error
+
+
+DISCOUNTS = [0.5, 0.9, 0.99, 1 - 2.0**-13, 0.1]
+
+
+@pytest.mark.parametrize("block", range(5))
+def test_random_problems_with_a_discount(block):
+    """Some of them without an attractor, some with gamma b >= 1."""
+    for i in range(12):
+        rng = np.random.default_rng([100 + block, i])
+        data = {**random_problem(rng), "discount": DISCOUNTS[int(rng.integers(len(DISCOUNTS)))]}
+        if rng.random() < 0.4:
+            data["attractor"] = {}
+        if rng.random() < 0.3:
+            data["gamma"] = float(rng.choice([1, 1.05, 2])) / data["discount"]
         try:
             compare(data)
         except AssertionError as error:

@@ -45,7 +45,7 @@ class Entries:
         self.terminal: Program | None = None
         if terminal is not None:
             self.terminal = Program([terminal], problem.system.constants())
-        self.factor = problem.gamma
+        self.factor = problem.gamma * (1.0 if problem.discount is None else problem.discount)
 
     @classmethod
     def of(cls, problem: Problem, partition: Partition, sets: CellSets | None) -> Self | None:

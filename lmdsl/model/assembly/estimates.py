@@ -40,13 +40,12 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     entry = 4 + (1 if S <= 2**8 else 2 if S <= 2**16 else 4)
     pairs = M * pilot.admissible
     # Of a pair the row, its end, control and cost; of a cell the sets, levels and weights.
-    model = N * (64 + pairs * (21 + pilot.entries * entry))
-    copied = (
-        pairs * (28 + pilot.entries * entry) if pilot.admissible < 1 else 0
-    )  # cells may be lost
+    entries = pilot.entries + (problem.discount is not None)
+    model = N * (64 + pairs * (21 + entries * entry))
+    copied = pairs * (28 + entries * entry) if pilot.admissible < 1 else 0  # cells may be lost
     # Of a pair whether it ties, and a unit cost; of a cell vectors, and the rows of a policy in
     # doubles.
-    solving = pairs * 9 + 130 + 24 * pilot.entries
+    solving = pairs * 9 + 130 + 24 * entries
     peak = MARGIN * (model + max(N * copied + _blocks(problem, S), N * solving))
     return int(min(peak + _grids(problem, M, S) + OVERHEAD, 1e30))
 

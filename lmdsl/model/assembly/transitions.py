@@ -22,10 +22,12 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.estimates import Pilot, estimate, require_least, unless_short
 from lmdsl.model.assembly.merging import BlockRows, Numbering, merge, merge_one, tile
 from lmdsl.model.assembly.sampler import CHUNK, Block, Sampler
+from lmdsl.model.discretization import Nodes
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.rows import Rows, Shares, code_type
+from lmdsl.model.rows import Rows, Shares, append_end, code_type
 from lmdsl.model.sets import CellSets
 from lmdsl.problem.problem import Problem
+from lmdsl.systems import MatrixSystem
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +60,10 @@ def assemble(
     require_least(problem)
     deadline = unless_short(problem, Deadline.of(deadline))
     sets = CellSets.of(problem, partition, deadline)
+    if isinstance(problem.system, MatrixSystem):
+        from lmdsl.model.assembly.given import of_matrices  # which makes what stands here
+
+        return of_matrices(problem, partition, sets)
     sampler = Sampler(problem, partition, deadline, sets=sets)
     try:
         return _assembled(problem, sets, sampler, progress, deadline)
@@ -77,9 +83,9 @@ def _assembled(
     pilot = _pilot(sampler, sets)
     memory.require(estimate(problem, pilot), "estimated from a few cells")
     F, M = len(sets.free), len(sampler.controls)
-    shares = Shares.of(len(sampler.points), sampler.nodes)
+    shares = shares_of(problem, len(sampler.points), sampler.nodes)
     pairs = int(F * M * min(1.0, 1.05 * pilot.admissible)) + M
-    capacity = int(pairs * 1.05 * pilot.entries) + sampler.samples
+    capacity = int(pairs * (1.05 * pilot.entries + (shares.ended is not None))) + sampler.samples
     pointer, control = _Growing(np.int64, pairs + 1), _Growing(np.int32, pairs)
     cost = _Growing(np.float64, pairs)
     target = _Growing(np.int32, capacity)
@@ -90,7 +96,7 @@ def _assembled(
     # glibc returns the memory of a block to the system, to fault it in again for the next one,
     # unless it has seen more than that freed at once.
     np.empty(2**20)
-    assembler, parts = _Assembler(sampler, sets), sampler.blocks(sets.free)
+    assembler, parts = _Assembler(sampler, sets, shares), sampler.blocks(sets.free)
     for block, rows in threads.in_order(assembler, parts, deadline.cancel):
         pair_pointer[1 + block.first : 1 + block.first + len(block.cells)] += rows.per_cell
         pointer.append(rows.end + target.used)
@@ -113,6 +119,12 @@ def _assembled(
     )
 
 
+def shares_of(problem: Problem, points: int, nodes: Nodes) -> Shares:
+    """Return what the codes of a problem's sampled rows stand for."""
+    shares = Shares.of(points, nodes)
+    return shares if problem.discount is None else shares.discounted(problem.discount)
+
+
 def outcome(sampler: Sampler, cell: int, control: int) -> Indices:
     """Return the image cell of every sample of one pair, -1 where it leaves, shape (S,)."""
     block = Block(0, np.array([cell]), (control, control + 1))
@@ -123,8 +135,9 @@ def outcome(sampler: Sampler, cell: int, control: int) -> Indices:
 class _Assembler:
     """Computes the rows of blocks; it may be called from several threads at once."""
 
-    def __init__(self, sampler: Sampler, sets: CellSets) -> None:
+    def __init__(self, sampler: Sampler, sets: CellSets, shares: Shares) -> None:
         self.sampler, nodes = sampler, sampler.nodes
+        self.columns, self.ended = len(sets.free), shares.ended
         sizes = np.bincount(nodes.group) * len(sampler.points)
         first_code = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
         bits = int(nodes.group.max()).bit_length()
@@ -165,9 +178,10 @@ class _Assembler:
             k = int(np.isnan(cost).argmax())
             cell = block.cells[np.searchsorted(np.cumsum(per_cell), k, side="right")]
             _refuse_cost(sampler, int(cell), int(control[k]))
-        return block, BlockRows(
-            per_cell, control, cost, end[:pairs], target[:entries], code[:entries]
-        )
+        parts = end[:pairs], target[:entries], code[:entries]
+        if self.ended is not None:
+            parts = append_end(*parts, self.columns, self.ended)
+        return block, BlockRows(per_cell, control, cost, *parts)
 
 
 def _pilot(sampler: Sampler, sets: CellSets) -> Pilot:

@@ -1,8 +1,8 @@
 """Results as directories: what each file says, written and read.
 
 A directory holds problem.json, certificate.json and solution.npz; for a system written in Python
-also model.npz, the compiled rows. Arrays are accepted only with the shape and type the problem
-implies.
+also model.npz, the compiled rows, and for a finite model its matrices. Arrays are accepted only
+with the shape and type the problem implies.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
-from lmdsl.common import arrays
+from lmdsl.common import arrays, inputs
 from lmdsl.common.files import MAX_FILE_BYTES, parsed, reason
 from lmdsl.common.records import jsonable
 from lmdsl.errors import BadInput, shown
@@ -33,7 +33,8 @@ from lmdsl.results.directory import reading, writing
 from lmdsl.results.directory.certificate_file import SCOPE, CertificateFile
 from lmdsl.results.directory.reading import FORMAT, Reading
 from lmdsl.results.result import ARRAYS, Result
-from lmdsl.systems import NAMED, FunctionSystem, System
+from lmdsl.systems import NAMED, FunctionSystem, MatrixSystem, System
+from lmdsl.systems.matrices.rows import MOST_LIMBS, GivenRows
 from lmdsl.systems.named import NamedOde, NotStored
 
 TYPES = {
@@ -89,6 +90,11 @@ def _contents(result: Result) -> dict[str, bytes]:
                 "compiled rows; copy that directory"
             )
         contents["model.npz"] = arrays.packed(_model_arrays(result.lp))
+    elif isinstance(problem.system, MatrixSystem):
+        rows = problem.system.rows
+        data = _function_problem(problem)
+        data["system"]["sizes"] = rows.sizes()
+        contents["model.npz"] = arrays.packed(rows.arrays())
     else:
         data = problem.to_dict()
     contents["problem.json"] = reading.text(data)
@@ -129,7 +135,7 @@ def identity(lp: StabilizationLP) -> str:
 
 
 def _function_problem(problem: Problem) -> dict[str, Any]:
-    """Return what can be stored of the problem of a Python function."""
+    """Return what JSON can say of the problem of a Python function, or of matrices."""
     data: dict[str, Any] = problem.model_dump(mode="json", exclude_none=True)
     return data
 
@@ -205,7 +211,7 @@ def _arrays(files: Reading, name: str, expected: arrays.Expected) -> dict[str, N
 
 def _read(files: Reading) -> Stored:
     content = files.open("problem.json", MAX_FILE_BYTES).read()
-    problem = _problem(parsed(files.folder / "problem.json", content))
+    problem = _problem(parsed(files.folder / "problem.json", content), files)
     stored = CertificateFile.read(files.certificate)
     partition = Partition.of(problem)
     N = partition.size
@@ -236,7 +242,7 @@ def _result(
     )  # fmt: skip
 
 
-def _problem(data: Any) -> Problem:
+def _problem(data: Any, files: Reading) -> Problem:
     system = data.get("system") if isinstance(data, dict) else None
     if not isinstance(system, dict):
         return parse_problem(data)
@@ -244,12 +250,31 @@ def _problem(data: Any) -> Problem:
     if "judged" not in system and (kind == "ode" or issubclass(NAMED.get(kind, System), NamedOde)):
         # Saved before paths were judged: the files mean what they meant.
         return parse_problem({**data, "system": {**system, "judged": "endpoint"}})
-    if kind != "function":
+    if kind == "matrices":
+        stand_in: System = _matrices(system, files)
+    elif kind == "function":  # it cannot be stored: everything but calling it still works
+        stand_in = FunctionSystem(next=_not_stored, parameters=system.get("parameters", {}))
+    else:
         return parse_problem(data)
-    # A function cannot be stored: everything but calling it still works.
-    stand_in = FunctionSystem(next=_not_stored, parameters=system.get("parameters", {}))
     problem: Problem = Problem.model_validate({**data, "system": stand_in})
     return problem
+
+
+def _matrices(system: dict[str, Any], files: Reading) -> MatrixSystem:
+    """Read the rows of a finite model."""
+    where = "problem.json.system.sizes"
+    held = system.get("sizes")
+    names = ("cells", "controls", "pairs", "entries", "codes", "limbs")
+    if not isinstance(held, dict) or set(held) != set(names):
+        raise BadInput(f"the sizes are those of {', '.join(names)}", where)
+    sizes = {name: inputs.whole(held[name], where, 0, 2**31) for name in names}
+    if sizes["limbs"] > MOST_LIMBS:
+        raise BadInput(f"{sizes['limbs']} digits; at most {MOST_LIMBS}", where)
+    expected = GivenRows.expected(sizes)
+    memory.require(12 * arrays.largest(expected), "the rows of a finite model")
+    rows = GivenRows.read(sizes, _arrays(files, "model.npz", expected))
+    more = {key: value for key, value in system.items() if key not in ("kind", "sizes")}
+    return MatrixSystem(**more, rows=rows)
 
 
 def _not_stored(**values: Any) -> Any:

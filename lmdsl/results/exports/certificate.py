@@ -91,6 +91,8 @@ def _head(result: Result, lp: StabilizationLP, refused: bool) -> dict[str, Any]:
         "cells": lp.n,
         "pairs": lp.K,
     }
+    if result.problem.discount is not None:
+        head["discount"] = result.problem.discount.hex()
     if not refused:
         for name in ("tolerance", "cost", "lower_bound", "contraction"):
             value = getattr(result, name)
@@ -112,8 +114,16 @@ def _lines(
         yield _line(entry)
     owner = np.repeat(np.arange(lp.n), np.diff(lp.pair_pointer))
     for k in range(lp.K):
-        row = [list(entry) for entry in lp.rows.exact(k)]
-        yield _line([int(owner[k]), int(lp.control[k]), float(lp.cost[k]).hex(), row])
+        pair = [int(owner[k]), int(lp.control[k]), float(lp.cost[k]).hex(), _row(lp, k)]
+        yield _line(pair if lp.rows.shares.total is not None else [*pair, lp.rows.total(k)])
+
+
+def _row(lp: StabilizationLP, k: int) -> list[list[int]]:
+    """Return a row as [target, numerator]; n is A, n + 1 the end of the run by discount."""
+    row = [list(entry) for entry in lp.rows.exact(k)]
+    if lp.rows.shares.ended is not None:
+        row[-1][0] += 1  # the last entry
+    return row
 
 
 def _line(data: Any) -> bytes:

@@ -1,7 +1,8 @@
 """The finite model in the explicit format (DRN) of the probabilistic model checker Storm.
 
 State i < n is the i-th cell of C, state n the attractor. The value of a state is the least expected
-``cost`` until ``attractor`` is reached: ``R{"cost"}min=? [F "attractor"]``.
+``cost`` until ``attractor`` is reached: ``R{"cost"}min=? [F "attractor"]``. With a discount state
+n + 1 is where runs end by it, and the value that of ``R{"cost"}min=? [F "attractor" | "ended"]``.
 """
 
 import os
@@ -31,8 +32,8 @@ def export_drn(lp: StabilizationLP, path: str | os.PathLike[str]) -> None:
     Notes
     -----
     Probabilities and costs are exact fractions. The reward model is ``cost``; the labels are
-    ``attractor`` and, on the cells where m > 0, ``init``. An action is named by the index of its
-    control.
+    ``attractor`` and, on the cells where m > 0, ``init``; with a discount also ``ended``. An action
+    is named by the index of its control.
 
     Raises
     ------
@@ -60,12 +61,16 @@ def write(result: Result, lp: StabilizationLP, path: str) -> None:
 
 
 def _lines(lp: StabilizationLP) -> Iterator[bytes]:
+    last = {lp.n: "attractor"}
+    if lp.rows.shares.ended is not None:
+        last[lp.n + 1] = "ended"
+    where = "".join(f"; state {j}: the {name}" for j, name in last.items())
     yield (
         "// written by lmdsl\n"
         f"// model {lp.digest}\n"
-        f"// states 0 to {lp.n - 1}: the stabilizable cells; state {lp.n}: the attractor\n"
+        f"// states 0 to {lp.n - 1}: the stabilizable cells{where}\n"
         "@type: MDP\n@parameters\n\n@reward_models\ncost\n"
-        f"@nr_states\n{lp.n + 1}\n@nr_choices\n{lp.K + 1}\n@model\n"
+        f"@nr_states\n{lp.n + len(last)}\n@nr_choices\n{lp.K + len(last)}\n@model\n"
     ).encode()
     for i in range(lp.n):
         text = [f"state {i} [0]{' init' if lp.weight[i] > 0 else ''}\n"]
@@ -73,12 +78,15 @@ def _lines(lp: StabilizationLP) -> Iterator[bytes]:
             text.append(f"\taction {lp.control[k]} [{Fraction(float(lp.cost[k]))}]\n")
             text += [f"\t\t{j} : {share}\n" for j, share in _row(lp, k)]
         yield "".join(text).encode()
-    yield f"state {lp.n} [0] attractor\n\taction stay [0]\n\t\t{lp.n} : 1\n".encode()
+    for j, name in last.items():
+        yield f"state {j} [0] {name}\n\taction stay [0]\n\t\t{j} : 1\n".encode()
 
 
 def _row(lp: StabilizationLP, k: int) -> list[tuple[int, Fraction]]:
     """Return a row as (target, probability), each target once and ascending, as Storm wants it."""
-    numerator: dict[int, int] = {}
-    for j, count in lp.rows.exact(k):
+    row, numerator = lp.rows.exact(k), dict[int, int]()
+    if lp.rows.shares.ended is not None:
+        row[-1] = (lp.n + 1, row[-1][1])  # the last entry
+    for j, count in row:
         numerator[j] = numerator.get(j, 0) + count
-    return [(j, Fraction(numerator[j], lp.rows.shares.total)) for j in sorted(numerator)]
+    return [(j, Fraction(numerator[j], lp.rows.total(k))) for j in sorted(numerator)]

@@ -1,0 +1,117 @@
+"""The rows of a finite model, given and not sampled, as transitions on the free cells."""
+
+import numpy as np
+
+from lmdsl.common.types import Bools, Floats, Indices
+from lmdsl.errors import BadInput
+from lmdsl.formulas.language import Formula
+from lmdsl.formulas.program import Program
+from lmdsl.machine import memory
+from lmdsl.model import discretization
+from lmdsl.model.assembly.estimates import Pilot, estimate
+from lmdsl.model.assembly.transitions import Transitions
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.rows import Rows, Shares, append_end, code_type
+from lmdsl.model.sets import CellSets
+from lmdsl.problem.problem import Problem
+from lmdsl.systems import MatrixSystem
+from lmdsl.systems.matrices.rows import GivenRows
+
+
+def of_matrices(problem: Problem, partition: Partition, sets: CellSets) -> Transitions:
+    """Return the transitions of a finite model.
+
+    A pair that may escape, or enter an avoid cell, is inadmissible.
+
+    Raises
+    ------
+    BadInput
+        It does not fit in memory, or the stage cost beside that of the matrices is no cost.
+    """
+    system = problem.system
+    assert isinstance(system, MatrixSystem)
+    given, number = system.rows, np.append(sets.number, np.int32(-1))
+    target = number[given.target]  # an escape, -1, is the last entry
+    free = sets.number[given.cell] < len(sets.free)
+    admissible = free & (sets.number[given.cell] >= 0) & ~_any(target < 0, given)
+    admitted = problem.admitted()
+    if admitted is not None:
+        admissible &= _at_pairs(problem, partition, given, admitted) != 0
+    kept = np.flatnonzero(admissible)
+    memory.require(estimate(problem, _pilot(given, kept, problem)), "the rows of a finite model")
+    entry = np.flatnonzero(np.repeat(admissible, np.diff(given.pointer)))
+    length = np.diff(given.pointer)[kept]
+    order = np.lexsort((target[entry], np.repeat(np.arange(len(kept)), length)))
+    shares, end = shares_of_matrices(problem, given), np.cumsum(length)
+    codes = given.code[entry][order].astype(code_type(len(shares.numerator)))
+    columns, F = target[entry][order], len(sets.free)
+    if shares.ended is not None:
+        end, columns, codes = append_end(end, columns, codes, F, shares.ended)
+    cell = sets.number[given.cell[kept]]
+    return Transitions(
+        sets=sets,
+        pair_pointer=np.searchsorted(cell, np.arange(F + 1)).astype(np.int64),
+        control=given.control[kept],
+        rows=Rows(np.concatenate([[0], end]).astype(np.int64), columns, codes, shares, F),
+        cost=_cost(problem, partition, system, kept, target == F),
+    )
+
+
+def shares_of_matrices(problem: Problem, given: GivenRows) -> Shares:
+    """Return what the codes of a finite model stand for."""
+    shares = Shares(given.numerator, None, given.values(), True, given.denominator)
+    return shares if problem.discount is None else shares.discounted(problem.discount)
+
+
+def _any(entries: Bools, given: GivenRows) -> Bools:
+    """Return for which pairs an entry is true."""
+    return np.bincount(given.owner(), entries, minlength=given.pairs) > 0
+
+
+def _pilot(given: GivenRows, kept: Indices, problem: Problem) -> Pilot:
+    pairs = max(given.cells * discretization.control_count(problem), 1)
+    mean = len(given.target) / max(given.pairs, 1)
+    return Pilot(len(kept) / pairs, mean * (8 if len(given.numerator) > 2**16 else 2))
+
+
+def _cost(
+    problem: Problem,
+    partition: Partition,
+    system: MatrixSystem,
+    kept: Indices,
+    absorbed: Bools,
+) -> Floats:
+    """Return the costs of the matrices, what is missed after A, and the stage cost beside."""
+    given = system.rows
+    cost: Floats = given.cost[kept]
+    entered = np.flatnonzero(absorbed)
+    paid = np.full(len(entered), system.missed(problem.gamma, problem.discount))
+    terminal = problem.terminal()
+    if terminal is not None:
+        centres = partition.centres(given.target[entered].astype(np.int64))
+        states = dict(zip(problem.states, centres.T, strict=True))
+        paid += Program([terminal], problem.system.constants())(states)[0]
+    if paid.any():
+        paid *= problem.gamma * (1.0 if problem.discount is None else problem.discount)
+        paid *= given.values()[given.code[entered]]
+        cost = cost + np.bincount(given.owner()[entered], paid, given.pairs)[kept]
+    if str(problem.stage_cost).strip() != "0":
+        cost = cost + _at_pairs(problem, partition, given, problem.cost())[kept]
+    if not (np.isfinite(cost) & (cost >= 0)).all():
+        k = kept[np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0]]
+        raise BadInput(
+            f"the cost of cell {given.cell[k]} under control {given.control[k]} is not finite and "
+            ">= 0",
+            "stage_cost",
+        )
+    return cost
+
+
+def _at_pairs(problem: Problem, partition: Partition, given: GivenRows, formula: Formula) -> Floats:
+    """Return a formula in state and control at every pair."""
+    centres = partition.centres(given.cell.astype(np.int64))
+    controls = discretization.control_vectors(problem)[given.control]
+    values = dict(zip(problem.states, centres.T, strict=True))
+    values |= dict(zip(problem.controls, controls.T, strict=True))
+    (found,) = Program([formula], problem.system.constants())(values)
+    return np.asarray(np.broadcast_to(found, given.pairs), dtype=np.float64)

@@ -1,0 +1,53 @@
+"""What ends a run: an attractor, a discount; and what a finite model has no place for."""
+
+import math
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+from lmdsl.errors import BadInput
+from lmdsl.systems import MatrixSystem
+
+if TYPE_CHECKING:
+    from lmdsl.problem.problem import Problem
+
+
+def rate(problem: "Problem") -> Fraction:
+    """Return gamma times the discount, exactly."""
+    return Fraction(problem.gamma) * Fraction(1 if problem.discount is None else problem.discount)
+
+
+def require_end(problem: "Problem") -> None:
+    """Refuse a problem with nothing to reach, unless its runs end by discount."""
+    if not problem.attractor.empty:
+        return
+    if problem.discount is None:
+        raise BadInput(
+            "no attractor cell; give points, boxes, cells or where (only with a discount may "
+            "there be none)",
+            "attractor",
+        )
+    if problem.local_controller is not None:
+        raise BadInput("there is no attractor cell to control; leave it out", "local_controller")
+
+
+def require_fit(problem: "Problem") -> None:
+    """Refuse what a finite model has no place for."""
+    system = problem.system
+    if not isinstance(system, MatrixSystem):
+        return
+    rows = system.rows
+    cells = math.prod(axis.cells for axis in problem.state_box.values())
+    controls = math.prod(axis.count() for axis in problem.control_grid.values())
+    if cells != rows.cells:
+        raise BadInput(f"{cells} cells; the matrices have {rows.cells}", "state_box")
+    if controls != rows.controls:
+        raise BadInput(f"{controls} controls; the matrices have {rows.controls}", "control_grid")
+    for where in ("noise", "local_controller"):
+        if getattr(problem, where) is not None:
+            raise BadInput("a finite model has none; leave it out", where)
+    if system.best_reward is not None and not rate(problem) < 1:
+        raise BadInput(
+            f"{problem.gamma!r} times the discount {problem.discount or 1!r} is not below 1, and "
+            "rewards are maximised; lower one of them (discount=0.99, say)",
+            "gamma",
+        )
