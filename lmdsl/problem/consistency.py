@@ -70,7 +70,11 @@ def _sets_named(problem: "Problem") -> None:
 def _points_named(points: Any, states: tuple[str, ...], where: str) -> None:
     for i, point in enumerate(points):
         if isinstance(point, dict) and set(point) != set(states):
-            raise BadInput(f"a point names every axis once: {', '.join(states)}", f"{where}[{i}]")
+            other = next((name for name in point if name not in states), "")
+            near = spelling.hint(other, states).replace("; did you mean", "; is", 1)
+            near = near and f"{near[:-1]} meant by {shown(other)}?"
+            fault = f"a point names every axis once: {', '.join(states)}"
+            raise BadInput(fault + near, f"{where}[{i}]")
         if len(point) != len(states):
             raise BadInput(f"{len(point)} coordinates for {len(states)} axes", f"{where}[{i}]")
 
