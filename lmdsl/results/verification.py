@@ -6,7 +6,7 @@ vectors are checked against it by the same inequalities that certified them.
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -33,7 +33,7 @@ from lmdsl.results.directory import archive
 from lmdsl.results.directory.audit import differences, function_differences, local_differences
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
-from lmdsl.systems import FunctionSystem
+from lmdsl.systems import FunctionSystem, MatrixSystem
 
 Judge = Callable[[StabilizationLP, Witness, float], Certificate]
 
@@ -56,6 +56,8 @@ class Verification:
         What does not hold, one sentence each.
     notes
         What else to know, one sentence each.
+    scope
+        What the claims speak of.
     """
 
     holds: bool
@@ -64,6 +66,7 @@ class Verification:
     certificate: Certificate
     reasons: tuple[str, ...]
     notes: tuple[str, ...]
+    scope: str = "the finite model: cells and sampled transitions"
 
     def text(self) -> str:
         """Return the outcome for people."""
@@ -72,9 +75,7 @@ class Verification:
         if proof.gap is not None:
             lines.append(f"  gap {proof.gap:.2g}, tolerance {proof.tolerance:.2g}")
         lines += [f"  {printable(sentence)}" for sentence in (*self.reasons, *self.notes)]
-        return "\n".join(
-            [*lines, "  (claims speak of the finite model: cells and sampled transitions)"]
-        )
+        return "\n".join([*lines, f"  (claims speak of {self.scope})"])
 
     __str__ = text
 
@@ -160,7 +161,11 @@ def verify(
     reasons += differences(whole, lp, result, stored.certificate, certificate)
     in_time()
     reasons += local_differences(lp, result, stored.certificate, deadline)
-    return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
+    found = Verification(
+        not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
+    )
+    system = result.problem.system
+    return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
 
 
 def _restricted(

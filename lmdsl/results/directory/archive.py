@@ -30,7 +30,7 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem, parse_problem
 from lmdsl.results.directory import reading, writing
-from lmdsl.results.directory.certificate_file import SCOPE, CertificateFile
+from lmdsl.results.directory.certificate_file import CertificateFile
 from lmdsl.results.directory.reading import FORMAT, Reading
 from lmdsl.results.result import ARRAYS, Result
 from lmdsl.systems import NAMED, FunctionSystem, MatrixSystem, System
@@ -114,7 +114,7 @@ def _certificate(result: Result) -> dict[str, Any]:
         "reasons": proof.reasons,
         "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
         "versions": versions(),
-        "scope": SCOPE,
+        "scope": result.problem.system.scope,
     }
     return {
         key: jsonable(apart[key] if key in apart else getattr(result, key))

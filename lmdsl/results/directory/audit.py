@@ -18,7 +18,7 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.optimize.feasibility import gamma_bar
 from lmdsl.results.directory.archive import identity
-from lmdsl.results.directory.certificate_file import SCOPE, CertificateFile
+from lmdsl.results.directory.certificate_file import CertificateFile
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.systems import FunctionSystem
@@ -57,7 +57,7 @@ def differences(
     beyond = jsonable(result.beyond_gamma)
     if "beyond_gamma" in certificate.model_fields_set and certificate.beyond_gamma != beyond:
         reasons.append("beyond_gamma is not the cells that solution.npz names")
-    if certificate.scope != SCOPE:
+    if certificate.scope != result.problem.system.scope:
         reasons.append("scope is not what verified speaks of")
     return reasons + _bracket(whole, result, found)
 

@@ -16,8 +16,7 @@ from lmdsl.errors import BadInput
 from lmdsl.results.directory.reading import COMMIT
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Seconds
-
-SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
+from lmdsl.systems import System
 
 T = TypeVar("T")
 Word = Annotated[T, Field(strict=False)]  # a member of an enum, by its value
@@ -80,7 +79,7 @@ class CertificateFile(_Keys):
     gap_before_polish: float | None
     model_sha256: str
     versions: dict[str, str] = Field(default_factory=dict)
-    scope: str = SCOPE
+    scope: str = System.scope
 
     @classmethod
     def read(cls, data: dict[str, Any]) -> Self:
