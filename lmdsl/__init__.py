@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from lmdsl.certificate.claims import Certificate as Certificate
     from lmdsl.control.controller import Controller as Controller
     from lmdsl.control.simulation import Simulation as Simulation
+    from lmdsl.data.from_data import from_data as from_data
+    from lmdsl.data.tables import read_data as read_data
     from lmdsl.errors import BadInput as BadInput
     from lmdsl.errors import LmdslError as LmdslError
     from lmdsl.explanation.causes import Explanation as Explanation
@@ -65,9 +67,11 @@ _HOME = {
     "compare": "results.comparison",
     "compile": "model.lp",
     "explain": "explanation.causes",
+    "from_data": "data.from_data",
     "from_matrices": "problem.from_matrices",
     "gamma_max": "optimize.feasibility.gamma_bar",
     "load": "problem.problem",
+    "read_data": "data.tables",
     "solve": "results.solving",
     "verify": "results.verification",
 }

@@ -45,6 +45,8 @@ class Certificate:
         The gap asked for.
     reasons
         Why it is not verified, one sentence each; empty when verified.
+    assumes
+        On what every claim rests beside the finite model; empty where on nothing.
     """
 
     stabilizing: bool
@@ -59,6 +61,7 @@ class Certificate:
     measure_residual: float | None
     tolerance: float
     reasons: tuple[str, ...] = ()
+    assumes: str = ""
 
     @property
     def verified(self) -> bool:
@@ -67,7 +70,10 @@ class Certificate:
         return claims and self.gap is not None and self.gap <= self.tolerance
 
     def __str__(self) -> str:
-        return f"verified, gap {self.gap:.2g}" if self.verified else "; ".join(self.reasons)
+        if not self.verified:
+            return "; ".join(self.reasons)
+        rests = f", assuming that {self.assumes}" if self.assumes else ""
+        return f"verified, gap {self.gap:.2g}{rests}"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; ``verified`` first, then the attributes."""

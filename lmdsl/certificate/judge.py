@@ -212,7 +212,10 @@ def _certificate(
                 f"the gap {gap:.3g} is above the tolerance {tolerance:.3g}" + _too_small(cost)
             )
     said: dict[str, Any] = {**holds, **numbers}
-    return Certificate(**said, gap=gap, tolerance=tolerance, reasons=tuple(reasons))
+    assumes = lp.problem.system.assumes
+    return Certificate(
+        **said, gap=gap, tolerance=tolerance, reasons=tuple(reasons), assumes=assumes
+    )
 
 
 def _too_small(cost: float | None) -> str:

@@ -136,6 +136,7 @@ def _summary(result: Any) -> str:
         return "not established" if value is None else format(value, digits)
 
     seconds = result.seconds
+    about = [] if result.data is None else result.data.rows()
     rows = [
         ("problem", printable(result.problem.name) or "(no name)"),
         ("status", result.status),
@@ -158,6 +159,7 @@ def _summary(result: Any) -> str:
             ("contraction", number(result.contraction)),
             ("polish steps", str(result.polish_steps)),
         ]
+    rows += about
     if result.local_controller:
         rows.append(("local", result.local_controller.sentence()))
     if result.gamma_bar:

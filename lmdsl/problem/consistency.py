@@ -70,11 +70,7 @@ def _sets_named(problem: "Problem") -> None:
 def _points_named(points: Any, states: tuple[str, ...], where: str) -> None:
     for i, point in enumerate(points):
         if isinstance(point, dict) and set(point) != set(states):
-            other = next((name for name in point if name not in states), "")
-            near = spelling.hint(other, states).replace("; did you mean", "; is", 1)
-            near = near and f"{near[:-1]} meant by {shown(other)}?"
-            fault = f"a point names every axis once: {', '.join(states)}"
-            raise BadInput(fault + near, f"{where}[{i}]")
+            raise BadInput(f"a point names every axis once: {', '.join(states)}", f"{where}[{i}]")
         if len(point) != len(states):
             raise BadInput(f"{len(point)} coordinates for {len(states)} axes", f"{where}[{i}]")
 

@@ -5,7 +5,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from lmdsl.errors import BadInput
-from lmdsl.systems import MatrixSystem
+from lmdsl.systems import DataSystem, MatrixSystem
 
 if TYPE_CHECKING:
     from lmdsl.problem.problem import Problem
@@ -45,6 +45,10 @@ def require_fit(problem: "Problem") -> None:
     for where in ("noise", "local_controller"):
         if getattr(problem, where) is not None:
             raise BadInput("a finite model has none; leave it out", where)
+    sure = isinstance(system, DataSystem) and system.confidence is not None
+    if sure and problem.terminal_cost is not None:
+        raise BadInput("the bounds of a confidence do not know it; leave one of them out",
+                       "terminal_cost")  # fmt: skip
     if system.best_reward is not None and not rate(problem) < 1:
         raise BadInput(
             f"{problem.gamma!r} times the discount {problem.discount or 1!r} is not below 1, and "

@@ -9,7 +9,15 @@ from pydantic import BeforeValidator, Discriminator, Tag
 
 from lmdsl.common.strict_model import Declared, SchemaWords
 from lmdsl.errors import BadInput
-from lmdsl.systems import NAMED, FunctionSystem, MapSystem, MatrixSystem, OdeSystem, System
+from lmdsl.systems import (
+    NAMED,
+    DataSystem,
+    FunctionSystem,
+    MapSystem,
+    MatrixSystem,
+    OdeSystem,
+    System,
+)
 
 
 class EachWords(SchemaWords):
@@ -61,7 +69,7 @@ class _KindsOfFiles:
 
 def _is_function(schema: dict[str, Any]) -> bool:
     """Return whether a schema, or what it refers to and may not be made yet, is a function's."""
-    names = (FunctionSystem.__name__, MatrixSystem.__name__)
+    names = (FunctionSystem.__name__, MatrixSystem.__name__, DataSystem.__name__)
     return schema == {"not": {}} or any(name in schema.get("$ref", "") for name in names)
 
 
@@ -71,10 +79,11 @@ def _refuse_functions(value: Any) -> Any:
             "kind 'function' cannot be declared as data; build a FunctionSystem in Python, "
             "or write formulas with kind 'map' or 'ode'"
         )
-    if isinstance(value, Mapping) and value.get("kind") == "matrices":
-        raise BadInput(
-            "kind 'matrices' cannot be declared as data; use lmdsl.from_matrices in Python"
-        )
+    for kind in ("matrices", "data"):
+        if isinstance(value, Mapping) and value.get("kind") == kind:
+            raise BadInput(
+                f"kind {kind!r} cannot be declared in a file; use lmdsl.from_{kind} in Python"
+            )
     return value
 
 
@@ -82,7 +91,7 @@ if TYPE_CHECKING:
     SystemUnion = System
 else:
     SystemUnion = Annotated[
-        kinds(MapSystem, OdeSystem, *NAMED.values(), FunctionSystem, MatrixSystem),
+        kinds(MapSystem, OdeSystem, *NAMED.values(), FunctionSystem, MatrixSystem, DataSystem),
         BeforeValidator(_refuse_functions),
         _KindsOfFiles(),
     ]

@@ -10,6 +10,7 @@ from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Certificate, Verified, Witness
 from lmdsl.common.types import Floats
 from lmdsl.control.invariance import examine
+from lmdsl.data.report import DataReport
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.partition import Partition
@@ -22,6 +23,7 @@ from lmdsl.results.polishing import _Outcome
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Coverage, Seconds
+from lmdsl.systems import DataSystem
 
 UNKNOWN = 255  # status of cells of which nothing is known
 
@@ -153,7 +155,11 @@ class _Job:
         solved = status != Status.NOT_STABILIZABLE
         attractor = lp.cell_status == CellStatus.ATTRACTOR
         local = LocalController.of(lp.problem, lp.partition, attractor)
-        note = attractor_note(lp.problem, lp.partition)
+        notes = [message, attractor_note(lp.problem, lp.partition)]
+        data = None
+        if isinstance(lp.problem.system, DataSystem):
+            data = DataReport.of(lp, witness.policy)
+            notes.append(data.sentence())
         return Result(
             status=status,
             backend=self.backend,
@@ -170,7 +176,8 @@ class _Job:
             stabilizable_cells=lp.n,
             local_controller=None if local is None else examine(lp.problem, local, self.finish),
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
-            message=f"{message}; {note}" if note else message,
+            message="; ".join(note for note in notes if note),
+            data=data,
             problem=lp.problem,
             partition=lp.partition,
             certificate=proof,

@@ -9,6 +9,7 @@ from lmdsl.common.records import Frozen, Reported, jsonable
 from lmdsl.common.types import Statuses
 from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.simulation import Simulation
+from lmdsl.data.report import DataReport
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.results.status import Status
@@ -86,6 +87,8 @@ class Summary(Frozen):
         Whether the problem's local controller keeps the attractor cells; None without one.
     simulation
         Runs of the true map that ``lmdsl solve`` made; None where none was asked for.
+    data
+        What was recorded, what is assumed and how sure it is; None unless solved from data.
     """
 
     status: Status
@@ -108,15 +111,17 @@ class Summary(Frozen):
     message: str = ""
     local_controller: LocalCheck | None = None
     simulation: Simulation | None = None
+    data: DataReport | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
-        names = [f.name for f in fields(Summary) if f.name != "simulation"]
+        names = [f.name for f in fields(Summary) if f.name not in ("simulation", "data")]
         return {
             **{name: jsonable(getattr(self, name)) for name in names},
             "beyond_gamma": jsonable(self.beyond_gamma),
             "coverage": jsonable(self.coverage),
             "simulation": jsonable(self.simulation),
+            "data": jsonable(self.data),
         }
 
     @property

@@ -6,7 +6,7 @@ vectors are checked against it by the same inequalities that certified them.
 
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -30,10 +30,15 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory import archive
-from lmdsl.results.directory.audit import differences, function_differences, local_differences
+from lmdsl.results.directory.audit import (
+    differences,
+    function_differences,
+    local_differences,
+    policy_of,
+)
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
-from lmdsl.systems import FunctionSystem, MatrixSystem
+from lmdsl.systems import FunctionSystem
 
 Judge = Callable[[StabilizationLP, Witness, float], Certificate]
 
@@ -56,8 +61,6 @@ class Verification:
         What does not hold, one sentence each.
     notes
         What else to know, one sentence each.
-    scope
-        What the claims speak of.
     """
 
     holds: bool
@@ -66,7 +69,6 @@ class Verification:
     certificate: Certificate
     reasons: tuple[str, ...]
     notes: tuple[str, ...]
-    scope: str = "the finite model: cells and sampled transitions"
 
     def text(self) -> str:
         """Return the outcome for people."""
@@ -75,7 +77,12 @@ class Verification:
         if proof.gap is not None:
             lines.append(f"  gap {proof.gap:.2g}, tolerance {proof.tolerance:.2g}")
         lines += [f"  {printable(sentence)}" for sentence in (*self.reasons, *self.notes)]
-        return "\n".join([*lines, f"  (claims speak of {self.scope})"])
+        if proof.assumes:
+            lines.append(f"  assumed: {proof.assumes}")
+            return "\n".join([*lines, "  (claims speak of the finite model of the recorded data)"])
+        return "\n".join(
+            [*lines, "  (claims speak of the finite model: cells and sampled transitions)"]
+        )
 
     __str__ = text
 
@@ -92,6 +99,7 @@ class Verification:
             "gap": jsonable(proof.gap),
             "tolerance": jsonable(proof.tolerance),
             "contraction": jsonable(proof.contraction),
+            "assumes": proof.assumes,
             "reasons": list(self.reasons),
             "notes": list(self.notes),
         }
@@ -161,11 +169,7 @@ def verify(
     reasons += differences(whole, lp, result, stored.certificate, certificate)
     in_time()
     reasons += local_differences(lp, result, stored.certificate, deadline)
-    found = Verification(
-        not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
-    )
-    system = result.problem.system
-    return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
+    return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
 
 
 def _restricted(
@@ -196,7 +200,7 @@ def recompiled(
 def _judge_claims(
     lp: StabilizationLP, result: Result, reasons: list[str], judge: Judge
 ) -> Certificate:
-    policy = _policy(lp, result)
+    policy = policy_of(lp, result)
     if policy is None:
         reasons.append("control_index is no policy on the stabilizable set")
     on = lp.cells
@@ -221,18 +225,6 @@ def _judge_refusal(
     if result.cause is None or not proved[result.cause]:
         reasons.append(f"the refusal ({result.cause}) is not proved by the recompiled model")
     return certificate
-
-
-def _policy(lp: StabilizationLP, result: Result) -> np.ndarray[Any, Any] | None:
-    """Return the columns of the stored controls, None where one is no surviving pair."""
-    wanted = result.control_index[lp.cells]
-    M = len(lp.controls)
-    key = lp.cell.astype(np.int64) * M + lp.control
-    target = np.arange(lp.n, dtype=np.int64) * M + wanted
-    policy = np.minimum(np.searchsorted(key, target), max(lp.K - 1, 0))
-    if not lp.K or (wanted < 0).any() or (key[policy] != target).any():
-        return None
-    return policy
 
 
 def _stored_model(path: str | os.PathLike[str], result: Result) -> StabilizationLP:

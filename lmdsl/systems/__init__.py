@@ -4,6 +4,7 @@ from lmdsl.systems.base import MapSystem as MapSystem
 from lmdsl.systems.base import OdeSystem as OdeSystem
 from lmdsl.systems.base import System as System
 from lmdsl.systems.function import FunctionSystem as FunctionSystem
+from lmdsl.systems.matrices.data import DataSystem as DataSystem
 from lmdsl.systems.matrices.system import MatrixSystem as MatrixSystem
 from lmdsl.systems.named import NamedSystem as NamedSystem
 

@@ -86,13 +86,10 @@ class StateMap(Protocol):
 
 
 class System(Declared):
-    """Base of all systems x+ = T(x, u, w); ``scope`` is what certificates of it speak of."""
-
-    scope: ClassVar[str] = (
-        "the finite model (cells and sampled transitions), not the map between samples"
-    )
+    """Base of all systems x+ = T(x, u, w)."""
 
     parameters: Parameters = Field(default_factory=dict, validate_default=True)
+    assumes: ClassVar[str] = ""  # on what every claim rests beside the finite model, if anything
 
     def constants(self) -> Mapping[str, float]:
         """Return the values of all parameters, defaults included."""

@@ -20,8 +20,8 @@ PACKAGE = Path(lm.__file__).parent
 # Data flows one way: a package imports only from packages before it, inside functions too.
 PACKAGES = [
     "errors", "machine", "common", "formulas", "systems", "problem", "model", "certificate",
-    "optimize", "backends", "control", "results", "explanation", "plotting", "testing", "cli",
-    "__main__",
+    "optimize", "backends", "data", "control", "results", "explanation", "plotting", "testing",
+    "cli", "__main__",
 ]  # fmt: skip
 
 # Imports against the order, inside functions: methods that only forward to a later package.
@@ -31,8 +31,8 @@ PUBLIC = [
     "Area", "BadInput", "CellStatus", "Certificate", "Comparison", "Controller", "Explanation",
     "GammaBar", "LmdslError", "PhaseOne", "Problem", "Region", "Result", "Simulation",
     "StabilizationLP", "TimeLimitReached", "Verification", "__version__", "backends",
-    "compare", "compile", "explain", "exports", "from_matrices",
-    "gamma_max", "load", "plotting", "solve", "systems", "testing", "verify",
+    "compare", "compile", "explain", "exports", "from_data", "from_matrices",
+    "gamma_max", "load", "plotting", "read_data", "solve", "systems", "testing", "verify",
 ]  # fmt: skip
 
 

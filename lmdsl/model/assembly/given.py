@@ -95,7 +95,7 @@ def _cost(
         paid *= problem.gamma * (1.0 if problem.discount is None else problem.discount)
         paid *= given.values()[given.code[entered]]
         cost = cost + np.bincount(given.owner()[entered], paid, given.pairs)[kept]
-    if str(problem.stage_cost).strip() != "0":
+    if not system.pays_all and str(problem.stage_cost).strip() != "0":
         cost = cost + _at_pairs(problem, partition, given, problem.cost())[kept]
     if not (np.isfinite(cost) & (cost >= 0)).all():
         k = kept[np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0]]

@@ -30,13 +30,14 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem, parse_problem
 from lmdsl.results.directory import reading, writing
-from lmdsl.results.directory.certificate_file import CertificateFile
+from lmdsl.results.directory.certificate_file import CertificateFile, scope
 from lmdsl.results.directory.reading import FORMAT, Reading
 from lmdsl.results.result import ARRAYS, Result
-from lmdsl.systems import NAMED, FunctionSystem, MatrixSystem, System
+from lmdsl.systems import NAMED, DataSystem, FunctionSystem, MatrixSystem, System
 from lmdsl.systems.matrices.rows import MOST_LIMBS, GivenRows
 from lmdsl.systems.named import NamedOde, NotStored
 
+GIVEN: dict[Any, type[MatrixSystem]] = {"matrices": MatrixSystem, "data": DataSystem}
 TYPES = {
     "control_index": "<i4",
     "value": "<f8",
@@ -114,7 +115,7 @@ def _certificate(result: Result) -> dict[str, Any]:
         "reasons": proof.reasons,
         "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
         "versions": versions(),
-        "scope": result.problem.system.scope,
+        "scope": scope(result.problem),
     }
     return {
         key: jsonable(apart[key] if key in apart else getattr(result, key))
@@ -235,7 +236,8 @@ def _result(
     known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said}
     proof: dict[str, Any] = {f.name: getattr(stored, f.name, None) for f in fields(Certificate)}
     proof |= {claim.name: stored.claims.get(claim.name, False) for claim in CLAIMS}
-    certificate = Certificate(**{**proof, "lower": stored.lower_bound})
+    proof |= {"lower": stored.lower_bound, "assumes": problem.system.assumes}
+    certificate = Certificate(**proof)
     return Result(
         **known, problem=problem, partition=partition, certificate=certificate,
         control_vectors=vectors,
@@ -250,8 +252,8 @@ def _problem(data: Any, files: Reading) -> Problem:
     if "judged" not in system and (kind == "ode" or issubclass(NAMED.get(kind, System), NamedOde)):
         # Saved before paths were judged: the files mean what they meant.
         return parse_problem({**data, "system": {**system, "judged": "endpoint"}})
-    if kind == "matrices":
-        stand_in: System = _matrices(system, files)
+    if kind in GIVEN:
+        stand_in: System = _matrices(GIVEN[kind], system, files)
     elif kind == "function":  # it cannot be stored: everything but calling it still works
         stand_in = FunctionSystem(next=_not_stored, parameters=system.get("parameters", {}))
     else:
@@ -260,7 +262,7 @@ def _problem(data: Any, files: Reading) -> Problem:
     return problem
 
 
-def _matrices(system: dict[str, Any], files: Reading) -> MatrixSystem:
+def _matrices(model: type[MatrixSystem], system: dict[str, Any], files: Reading) -> MatrixSystem:
     """Read the rows of a finite model."""
     where = "problem.json.system.sizes"
     held = system.get("sizes")
@@ -274,7 +276,8 @@ def _matrices(system: dict[str, Any], files: Reading) -> MatrixSystem:
     memory.require(12 * arrays.largest(expected), "the rows of a finite model")
     rows = GivenRows.read(sizes, _arrays(files, "model.npz", expected))
     more = {key: value for key, value in system.items() if key not in ("kind", "sizes")}
-    return MatrixSystem(**more, rows=rows)
+    found: MatrixSystem = model.model_validate({**more, "rows": rows})
+    return found
 
 
 def _not_stored(**values: Any) -> Any:

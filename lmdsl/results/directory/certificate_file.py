@@ -12,11 +12,21 @@ from pydantic import BeforeValidator, ConfigDict, Field, create_model
 from lmdsl.common.files import joined
 from lmdsl.common.strict_model import Declared, plain
 from lmdsl.control.invariance import LocalCheck
+from lmdsl.data.report import DataReport
 from lmdsl.errors import BadInput
+from lmdsl.problem.problem import Problem
 from lmdsl.results.directory.reading import COMMIT
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Seconds
-from lmdsl.systems import System
+
+SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
+
+
+def scope(problem: Problem) -> str:
+    """Return of what the claims speak, and what they assume."""
+    assumes = problem.system.assumes
+    return SCOPE if not assumes else f"the finite model of the recorded data; assumed: {assumes}"
+
 
 T = TypeVar("T")
 Word = Annotated[T, Field(strict=False)]  # a member of an enum, by its value
@@ -40,6 +50,8 @@ def _record(kind: type[Any]) -> BeforeValidator:
     model = create_model(kind.__name__, __base__=_Keys, **keys)
 
     def read(value: Any) -> Any:
+        if isinstance(value, dict):
+            value = {key: plain(part) for key, part in value.items()}
         return value if value is None else kind(**dict(model.model_validate(value)))
 
     return BeforeValidator(read)
@@ -70,6 +82,7 @@ class CertificateFile(_Keys):
     seconds: Annotated[Seconds, _record(Seconds)]
     message: str
     local_controller: Annotated[LocalCheck | None, _record(LocalCheck)] = None
+    data: Annotated[DataReport | None, _record(DataReport)] = None
     beyond_gamma: dict[str, Any] | None = None
     cause: Word[Cause | None]
     claims: dict[str, bool]
@@ -79,7 +92,7 @@ class CertificateFile(_Keys):
     gap_before_polish: float | None
     model_sha256: str
     versions: dict[str, str] = Field(default_factory=dict)
-    scope: str = System.scope
+    scope: str = SCOPE
 
     @classmethod
     def read(cls, data: dict[str, Any]) -> Self:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -27,7 +27,6 @@ class MatrixSystem(System):
         attractor costs R/(1 - gamma b), what is missed there for ever. None for costs.
     """
 
-    scope: ClassVar[str] = "the finite model as it was given"
     kind: Literal["matrices"] = "matrices"
     rows: GivenRows = Field(exclude=True)
     best_reward: Number | None = None
@@ -46,6 +45,11 @@ class MatrixSystem(System):
     ) -> StateMap:
         """See :meth:`System.compile`; the map is defined, but refuses to be evaluated."""
         return GivenMap()
+
+    @property
+    def pays_all(self) -> bool:
+        """Whether the costs of the rows are all that is paid, or the stage cost comes beside."""
+        return False
 
     def missed(self, gamma: float, discount: float | None) -> float:
         """Return R/(1 - gamma b), what R in every step for ever would earn; 0 for costs."""

@@ -1,0 +1,1 @@
+"""Recorded transitions: read, binned into rows, and how sure their probabilities are."""
