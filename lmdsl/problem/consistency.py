@@ -7,19 +7,11 @@ from lmdsl.common import spelling
 from lmdsl.errors import BadInput, shown
 from lmdsl.problem import endings
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
-from lmdsl.systems import MatrixSystem, OdeSystem
+from lmdsl.systems import OdeSystem
 from lmdsl.systems.named import NamedOde
 
 if TYPE_CHECKING:
     from lmdsl.problem.problem import Problem
-
-
-def require_writable(problem: "Problem") -> None:
-    """Refuse a problem that no file can hold."""
-    for key in problem.functions:
-        raise BadInput("a FunctionSystem or function cannot be written; use formulas", key)
-    if isinstance(problem.system, MatrixSystem):
-        raise BadInput("a file holds no matrices; save the result of solving it", "system")
 
 
 def require_consistent(problem: "Problem") -> None:
@@ -78,7 +70,11 @@ def _sets_named(problem: "Problem") -> None:
 def _points_named(points: Any, states: tuple[str, ...], where: str) -> None:
     for i, point in enumerate(points):
         if isinstance(point, dict) and set(point) != set(states):
-            raise BadInput(f"a point names every axis once: {', '.join(states)}", f"{where}[{i}]")
+            other = next((name for name in point if name not in states), "")
+            near = spelling.hint(other, states).replace("; did you mean", "; is", 1)
+            near = near and f"{near[:-1]} meant by {shown(other)}?"
+            fault = f"a point names every axis once: {', '.join(states)}"
+            raise BadInput(fault + near, f"{where}[{i}]")
         if len(point) != len(states):
             raise BadInput(f"{len(point)} coordinates for {len(states)} axes", f"{where}[{i}]")
 

@@ -31,7 +31,6 @@ from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory import archive
 from lmdsl.results.directory.audit import (
-    NOT_EVALUATED,
     differences,
     function_differences,
     local_differences,
@@ -39,6 +38,7 @@ from lmdsl.results.directory.audit import (
 )
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
+from lmdsl.systems import FunctionSystem, MatrixSystem
 
 Judge = Callable[[StabilizationLP, Witness, float], Certificate]
 
@@ -61,6 +61,8 @@ class Verification:
         What does not hold, one sentence each.
     notes
         What else to know, one sentence each.
+    scope
+        What the claims speak of.
     """
 
     holds: bool
@@ -69,6 +71,7 @@ class Verification:
     certificate: Certificate
     reasons: tuple[str, ...]
     notes: tuple[str, ...]
+    scope: str = "the finite model: cells and sampled transitions"
 
     def text(self) -> str:
         """Return the outcome for people."""
@@ -80,9 +83,7 @@ class Verification:
         if proof.assumes:
             lines.append(f"  assumed: {proof.assumes}")
             return "\n".join([*lines, "  (claims speak of the finite model of the recorded data)"])
-        return "\n".join(
-            [*lines, "  (claims speak of the finite model: cells and sampled transitions)"]
-        )
+        return "\n".join([*lines, f"  (claims speak of {self.scope})"])
 
     __str__ = text
 
@@ -146,11 +147,11 @@ def verify(
     ]
     lp = whole = recompiled(path, result, progress, deadline)
     in_time()
-    functions = result.problem.functions
-    if functions:
+    if isinstance(result.problem.system, FunctionSystem):
         reasons += function_differences(lp, result)
-        notes.insert(0, NOT_EVALUATED[functions])
-        if "system" in functions and result.local_controller is not None:
+        about = "the system is a Python function, which was not re-evaluated: its saved rows"
+        notes.insert(0, f"{about} were checked")
+        if result.local_controller is not None:
             notes.append("what the local controller does was not checked")
         if (result.cell_status == CellStatus.BEYOND_GAMMA).any():
             notes.append("that gamma is infeasible from the cells left out was not checked")
@@ -169,7 +170,11 @@ def verify(
     reasons += differences(whole, lp, result, stored.certificate, certificate)
     in_time()
     reasons += local_differences(lp, result, stored.certificate, deadline)
-    return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
+    found = Verification(
+        not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
+    )
+    system = result.problem.system
+    return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
 
 
 def _restricted(
@@ -191,17 +196,10 @@ def recompiled(
     progress: Progress | None = None,
     time_limit: float | Deadline | None = None,
 ) -> StabilizationLP:
-    """Return the finite model of a directory made anew; of Python functions, what they gave."""
-    problem = result.problem
-    if "system" in problem.functions:
+    """Return the finite model of a directory made anew; of a Python function, its saved rows."""
+    if isinstance(result.problem.system, FunctionSystem):
         return _stored_model(path, result)
-    if not problem.functions:
-        return compile(problem, progress, time_limit)
-    lp = compile(problem.replaced(stage_cost="0"), progress, time_limit)
-    cost = archive.read_model(path, result, {"cost": ((lp.K,), "<f8")})["cost"]
-    if not (np.isfinite(cost) & (cost >= 0)).all():
-        raise BadInput("the saved costs are inconsistent", "model.npz")
-    return replace(lp, problem=problem, cost=cost)
+    return compile(result.problem, progress, time_limit)
 
 
 def _judge_claims(

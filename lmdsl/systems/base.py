@@ -86,7 +86,11 @@ class StateMap(Protocol):
 
 
 class System(Declared):
-    """Base of all systems x+ = T(x, u, w)."""
+    """Base of all systems x+ = T(x, u, w); ``scope`` is what certificates of it speak of."""
+
+    scope: ClassVar[str] = (
+        "the finite model (cells and sampled transitions), not the map between samples"
+    )
 
     parameters: Parameters = Field(default_factory=dict, validate_default=True)
     assumes: ClassVar[str] = ""  # on what every claim rests beside the finite model, if anything

@@ -11,8 +11,7 @@ from problems import made, standard_map, steps
 
 import lmdsl as lm
 from lmdsl.systems import FunctionSystem
-from lmdsl.systems.black_box.function_map import FunctionMap
-from lmdsl.systems.black_box.returned import Returned
+from lmdsl.systems.function import FunctionMap
 
 NOISE = {"w": {"values": [-0.01, 0.01], "weights": [0.5, 0.5]}}
 
@@ -283,7 +282,7 @@ def test_images_in_the_same_memory_are_refused():
 
 def test_images_that_change_later_were_copied():
     kept = np.empty(3)
-    step = FunctionMap(lambda x: {"x": np.multiply(x, 2, out=kept)}, Returned(("x",), "next"), {})
+    step = FunctionMap(lambda x: {"x": np.multiply(x, 2, out=kept)}, ("x",), {})
     (first,) = step({"x": np.ones(3)})
     step({"x": np.zeros(3)})
     assert first.tolist() == [2, 2, 2]

@@ -18,11 +18,15 @@ from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.formulas.intervals import Interval
 from lmdsl.formulas.language import Formula, negation
 from lmdsl.formulas.program import Program
+from lmdsl.machine import memory
 from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.grid.partition import Partition
 
 # Cells or parts at a time, but for twice the parts of a cell.
 CHUNK: Final = 2**14
+
+# Bytes of a cell while it is decided whether the condition holds on it.
+CELL: Final = 24
 
 # Bisections of an axis: so many for every cell, then up to so many while few parts are open.
 LEAST: Final = 6
@@ -58,6 +62,7 @@ def certain(
     axes = [k for k, name in enumerate(partition.names) if name in program.names]
     test = _Test(program, [partition.names[k] for k in axes], guard)
     shape = [int(partition.cells[k]) for k in axes]
+    memory.require(CELL * math.prod(shape) + partition.size, "the cells of a condition")
     held = np.zeros(math.prod(shape), dtype=np.bool_)
     open_ = []
     for start in range(0, len(held), CHUNK):

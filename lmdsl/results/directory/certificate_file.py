@@ -18,14 +18,15 @@ from lmdsl.problem.problem import Problem
 from lmdsl.results.directory.reading import COMMIT
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Seconds
-
-SCOPE = "the finite model (cells and sampled transitions), not the map between samples"
+from lmdsl.systems import System
 
 
 def scope(problem: Problem) -> str:
     """Return of what the claims speak, and what they assume."""
-    assumes = problem.system.assumes
-    return SCOPE if not assumes else f"the finite model of the recorded data; assumed: {assumes}"
+    system = problem.system
+    if not system.assumes:
+        return system.scope
+    return f"the finite model of the recorded data; assumed: {system.assumes}"
 
 
 T = TypeVar("T")
@@ -92,7 +93,7 @@ class CertificateFile(_Keys):
     gap_before_polish: float | None
     model_sha256: str
     versions: dict[str, str] = Field(default_factory=dict)
-    scope: str = SCOPE
+    scope: str = System.scope
 
     @classmethod
     def read(cls, data: dict[str, Any]) -> Self:

@@ -126,6 +126,11 @@ def _mean(listing: Listing) -> Floats:
         total = np.bincount(listing.pair, share * listing.value, minlength=K)
         weight = np.bincount(listing.pair, share, minlength=K)
         mean = total / np.where(weight > 0, weight, 1.0)
+    start = np.flatnonzero(np.diff(listing.pair, prepend=-1))
+    if len(start):  # of equal costs the mean is no more and no less
+        least = np.minimum.reduceat(listing.value, start)
+        equal = least == np.maximum.reduceat(listing.value, start)
+        mean[listing.pair[start[equal]]] = least[equal]
     if listing.of_pair is not None:
         mean = mean + listing.of_pair
     return np.asarray(mean)

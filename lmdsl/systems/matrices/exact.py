@@ -106,9 +106,9 @@ def _off(
     sums: NDArray[Any], total: NDArray[Any], goal: Fraction, rounded: bool
 ) -> NDArray[np.intp]:
     """Return the rows that do not sum to a goal, within 1e-9 where they are rounded."""
-    with np.errstate(all="ignore"):
-        share = sums.astype(np.float64) / total.astype(np.float64)
-    clear = np.abs(share - float(goal)) <= (0.5e-9 if rounded else -1.0)
+    clear = np.zeros(len(sums), dtype=np.bool_)
+    if rounded and sums.dtype != object:
+        clear = np.abs(sums / total - float(goal)) <= 0.5e-9
     doubtful = np.flatnonzero(~clear)
     exactly = [Fraction(int(sums[r]), int(total[r])) for r in doubtful.tolist()]
     near = [abs(x - goal) <= NEAR if rounded else x == goal for x in exactly]

@@ -190,7 +190,8 @@ def _is_triple(P: Any) -> bool:
         isinstance(P, tuple | list)
         and len(P) == 3
         and not any(map(is_sparse, P[1:]))
-        and len(np.shape(P[1])) == 1 == len(np.shape(P[2]))
+        and np.ndim(P[1]) == 1 == np.ndim(P[2])
+        and (is_sparse(P[0]) or np.ndim(P[0]) == 2)
     )
 
 

@@ -140,13 +140,14 @@ class GivenRows(Frozen):
 
     def require_sound(self) -> None:
         """Refuse rows that are none."""
-        pointer, first = self.pointer, np.diff(self.owner(), prepend=-1) != 0
+        pointer = self.pointer
+        ends = pointer[0], pointer[-1]
+        if ends != (0, len(self.target)) or not (np.diff(pointer) > 0).all():
+            raise BadInput("the rows are inconsistent", "model.npz.pointer")
+        first = np.diff(self.owner(), prepend=-1) != 0
         key = self.cell.astype(np.int64) * self.controls + self.control
         sound = (
-            pointer[0] == 0
-            and (np.diff(pointer) > 0).all()
-            and pointer[-1] == len(self.target)
-            and ((self.cell >= 0) & (self.cell < self.cells)).all()
+            ((self.cell >= 0) & (self.cell < self.cells)).all()
             and ((self.control >= 0) & (self.control < self.controls)).all()
             and (np.diff(key) > 0).all()
             and ((self.target >= ESCAPES) & (self.target < self.cells)).all()

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -27,6 +27,7 @@ class MatrixSystem(System):
         attractor costs R/(1 - gamma b), what is missed there for ever. None for costs.
     """
 
+    scope: ClassVar[str] = "the finite model as it was given"
     kind: Literal["matrices"] = "matrices"
     rows: GivenRows = Field(exclude=True)
     best_reward: Number | None = None

@@ -1,1 +1,0 @@
-"""Systems of other tools, translated to formulas where the language allows."""
