@@ -38,6 +38,18 @@ MEANING = {
 }
 
 
+def _meanings(problem: Problem) -> dict[str, str]:
+    """Return what each cause means, by its name."""
+    meaning = dict(MEANING)
+    if isinstance(problem.system, MatrixSystem):
+        meaning[CellStatus.ESCAPES] = "every action may escape or enter avoid, or there is none"
+    elif problem.admissible is not None:
+        meaning[CellStatus.ESCAPES] += ", or is not admissible at one"
+    if problem.ends_in_time:
+        meaning[CellStatus.LEADS_TO_THESE] = "no control is without the risk of a cell that is lost"
+    return {NAMES[status]: text for status, text in meaning.items()}
+
+
 @dataclass(frozen=True)
 class LostCells:
     """The cells that one cause keeps outside C.
@@ -187,9 +199,8 @@ class Explanation(Frozen):
         stabilizable = int((self.cell_status == CellStatus.STABILIZED).sum())
         lines = [f"{self.lost} of {self.lost + stabilizable} cells outside A and avoid cannot be "
                  "stabilized"]  # fmt: skip
-        meaning = {NAMES[status]: text for status, text in MEANING.items()}
-        if self.problem.admissible is not None:
-            meaning[NAMES[CellStatus.ESCAPES]] += ", or is not admissible at one"
+        meaning = _meanings(self.problem)
+        finite_model = isinstance(self.problem.system, MatrixSystem)
         for cause in self.causes:
             lines += ["", f"{cause.name}, {cause.cells} cells: {meaning[cause.name]}"]
             for region in cause.regions:
@@ -197,7 +208,7 @@ class Explanation(Frozen):
                 lines.append(f"    {self.why(region.cell).first}")
             if cause.elsewhere:
                 lines.append(f"  {cause.elsewhere} elsewhere")
-        if self.lost:
+        if self.lost and not finite_model:
             lines += ["", "what would help, as far as trials with the true map show:"]
             lines += [f"  {hint.text}" for hint in self.hints] or ["  nothing that was tried"]
         if self.phase_one:

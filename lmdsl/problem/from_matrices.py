@@ -12,9 +12,9 @@ from lmdsl.problem.axes import Axis
 from lmdsl.problem.controls import ControlValues
 from lmdsl.problem.problem import Problem
 from lmdsl.problem.sampling import Grid
-from lmdsl.problem.sets import MAX_BOXES, Attractor, Avoid
+from lmdsl.problem.sets import MAX_BOXES, Attractor, Avoid, Measure
 from lmdsl.systems.matrices.costs import paid, with_cost
-from lmdsl.systems.matrices.drn import labelled, read_drn
+from lmdsl.systems.matrices.drn import Explicit, labelled, read_drn
 from lmdsl.systems.matrices.exact import exact
 from lmdsl.systems.matrices.layouts import layout_of, read_arrays, read_gymnasium
 from lmdsl.systems.matrices.listing import Listing
@@ -55,8 +55,9 @@ def from_matrices(
         infinite where a pair is inadmissible. For ``drn`` the name of a reward model, and None
         where it has one; None for ``gymnasium``.
     targets, avoid
-        States: the attractor, and what counts as an escape. For ``drn`` also a label. May be empty
-        with a discount, and where transitions terminate.
+        States: the attractor, and what counts as an escape. For ``drn`` also a label; the label
+        ``init`` says where runs begin (``measure``). May be empty with a discount, and where
+        transitions terminate.
     gamma, discount
         As in a problem file.
     layout
@@ -109,7 +110,8 @@ def from_matrices(
         state_box={STATE: Axis(low=-0.5, high=cells - 0.5, cells=cells)},
         control_grid={ACTION: ControlValues(values=tuple(map(float, range(listing.actions))))},
         attractor=Attractor(cells=tuple((cell,) for cell in reached)),
-        avoid=_boxes(unsafe),
+        avoid=Avoid(boxes=_boxes(unsafe, "avoid")) if unsafe.any() else None,
+        measure=_begins(found, goal | unsafe),
         stage_cost="0",
         sampling=Grid(per_axis=1),
         gamma=float(gamma),
@@ -117,7 +119,7 @@ def from_matrices(
     )
 
 
-def _read(P: Any, cost: Any, layout: str) -> tuple[Listing, Any]:
+def _read(P: Any, cost: Any, layout: str) -> tuple[Listing, Explicit | None]:
     if layout == "drn":
         if not isinstance(P, str | os.PathLike):
             raise BadInput(f"{shown(P)} is no path of a DRN file", "P")
@@ -133,7 +135,7 @@ def _there(listing: Listing) -> Bools:
     return np.bincount(listing.pair, minlength=len(listing.state)) > 0
 
 
-def _states(given: Any, where: str, count: int, found: Any) -> Bools:
+def _states(given: Any, where: str, count: int, found: Explicit | None) -> Bools:
     """Return a mask of states named by number, by mask, or by label."""
     mask = np.zeros(count, dtype=np.bool_)
     if isinstance(given, str):
@@ -156,16 +158,22 @@ def _states(given: Any, where: str, count: int, found: Any) -> Bools:
     return mask
 
 
-def _boxes(mask: Bools) -> Avoid | None:
+def _begins(found: Explicit | None, elsewhere: Bools) -> Measure | None:
+    """Return the weight of the initial states that a file names; None where there are none."""
+    initial = np.zeros(len(elsewhere), dtype=np.bool_)
+    initial[found.labels.get("init", []) if found else []] = True
+    initial &= ~elsewhere
+    return Measure(boxes=_boxes(initial, "measure")) if initial.any() else None
+
+
+def _boxes(mask: Bools, where: str) -> tuple[dict[str, tuple[float, float]], ...]:
     """Return the boxes that cover the cells of a mask, a box for each run of neighbours."""
     edges: Indices = np.flatnonzero(np.diff(mask, prepend=False, append=False))
-    if not len(edges):
-        return None
     if len(edges) > 2 * MAX_BOXES:
         raise BadInput(
-            f"{len(edges) // 2} separate runs of states; at most {MAX_BOXES}: leave out the rows "
-            "that lead there instead",
-            "avoid",
+            f"{len(edges) // 2} separate runs of states; at most {MAX_BOXES}: order the states so "
+            "that they are neighbours",
+            where,
         )
     ends = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-    return Avoid(boxes=tuple({STATE: (a - 0.5, b - 0.5)} for a, b in ends))
+    return tuple({STATE: (a - 0.5, b - 0.5)} for a, b in ends)

@@ -288,6 +288,11 @@ def _refuse_broken(rows: Rows, small: dict[str, Any], controls: int) -> None:
     )
     if not sound:
         raise BadInput("the saved rows are inconsistent", "model.npz")
+    ended = rows.shares.ended
+    if ended is not None:
+        at, last = np.flatnonzero(rows.code == ended), pointer[1:] - 1
+        if not (np.array_equal(at, last) and (rows.target[last] == rows.columns).all()):
+            raise BadInput("not every row ends by discount as its last entry", "model.npz")
     for k in range(rows.count):
         if sum(share for _, share in rows.exact(k)) != rows.total(k):
             raise BadInput(f"row {k} does not sum to 1", "model.npz")

@@ -213,6 +213,22 @@ def test_a_python_function_with_a_discount(tmp_path):
     assert lm.verify(tmp_path / "out").holds
 
 
+def test_saved_rows_of_a_function_end_as_the_discount_says(tmp_path):
+    data = wandering()
+    del data["system"], data["format"]
+    system = lm.systems.FunctionSystem(next=lambda x, u, w: {"x": 0.8 * x + 0.1 * u + w})
+    result = lm.solve(lm.Problem(system=system, **data))
+    result.save(tmp_path / "out")
+    with np.load(tmp_path / "out/model.npz") as held:
+        model = dict(held)
+    first, last = model["pointer"][:2]
+    for name in ("target", "code"):  # the same entries, the end of the run first
+        model[name][first:last] = np.roll(model[name][first:last], 1)
+    np.savez(tmp_path / "out/model.npz", **model)
+    with pytest.raises(lm.BadInput, match=r"model\.npz: not every row ends by discount"):
+        lm.verify(tmp_path / "out")
+
+
 def test_backends_agree():
     found = lm.compare(made(wandering()), ["policy-iteration", "highs"])
     assert found.exit_status == 0

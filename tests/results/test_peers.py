@@ -207,6 +207,15 @@ def test_our_own_drn_read_back(data, tmp_path):
     np.testing.assert_allclose(b.value[again.cells], a.value[lp.cells], rtol=1e-12)
 
 
+def test_initial_states_are_read_back(tmp_path):
+    data = steps(measure={"boxes": [{"x": [0.25, 0.5]}, {"x": [0.75, 1]}]})
+    result = lm.solve(made(data))
+    export_drn(result.lp, tmp_path / "model.drn")
+    again = lm.solve(lm.from_matrices(tmp_path / "model.drn", targets="attractor"))
+    assert again.lp.weight.tolist() == result.lp.weight.tolist() == [0.5, 0, 0.5]
+    assert again.cost == pytest.approx(result.cost)
+
+
 def row(lp, k):
     found: dict[int, Fraction] = {}
     for j, c in lp.rows.exact(k):
@@ -251,6 +260,7 @@ def test_a_file_of_storm(tmp_path):
     result = lm.solve(lm.from_matrices(path, "energy", targets="done"))
     # V0 = 1 + 0.5 + 0.3 V1 (going), V1 = 2 + V0/3
     V0 = (1.5 + 0.6) / (1 - 0.1)
+    assert result.cost == pytest.approx(V0)  # runs begin in the state labelled init
     np.testing.assert_allclose(result.value, [V0, 2 + V0 / 3, 0], rtol=1e-8)
     steps_ = lm.solve(lm.from_matrices(str(path), "steps", targets=[2]))
     np.testing.assert_allclose(steps_.value[:2], [1.3 / 0.9, 1 + 1.3 / 2.7], rtol=1e-8)

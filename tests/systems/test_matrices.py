@@ -79,6 +79,8 @@ def test_rows_below_one_escape_and_above_are_refused():
     assert str(lm.explain(problem).why(0).moves[0]) == (
         "action = 0 loses 10 %: its row sums to so much less than 1"
     )
+    assert "every action may escape or enter avoid" in str(lm.explain(problem))
+    assert "true map" not in str(lm.explain(problem))
     for row in ([0.5, 0.6], [THIRD, 1]):
         with pytest.raises(lm.BadInput, match=r"^P: state 0, action 0: .* more than 1$"):
             lm.from_matrices([row, [0, 1]], [1, 1], [1])

@@ -8,7 +8,7 @@ from lmdsl.formulas.language import Formula
 from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
 from lmdsl.model import discretization
-from lmdsl.model.assembly.estimates import Pilot, estimate
+from lmdsl.model.assembly.estimates import CODE, Pilot, estimate
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.rows import Rows, Shares, append_end, code_type
@@ -30,6 +30,7 @@ def of_matrices(problem: Problem, partition: Partition, sets: CellSets) -> Trans
     """
     system = problem.system
     assert isinstance(system, MatrixSystem)
+    memory.require(CODE * len(system.rows.numerator), "the shares of a finite model")
     given, number = system.rows, np.append(sets.number, np.int32(-1))
     target = number[given.target]  # an escape, -1, is the last entry
     free = sets.number[given.cell] < len(sets.free)
@@ -70,8 +71,7 @@ def _any(entries: Bools, given: GivenRows) -> Bools:
 
 def _pilot(given: GivenRows, kept: Indices, problem: Problem) -> Pilot:
     pairs = max(given.cells * discretization.control_count(problem), 1)
-    mean = len(given.target) / max(given.pairs, 1)
-    return Pilot(len(kept) / pairs, mean * (8 if len(given.numerator) > 2**16 else 2))
+    return Pilot(len(kept) / pairs, len(given.target) / max(given.pairs, 1))
 
 
 def _cost(

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -194,7 +193,7 @@ def _fault(number: int, text: str) -> BadInput:
     return BadInput(f"line {number}: {text}", "P")
 
 
-def labelled(found: Any, labels: list[str]) -> list[int]:
+def labelled(found: Explicit, labels: list[str]) -> list[int]:
     """Return the states with any of some labels."""
     for label in labels:
         if label not in found.labels:

@@ -42,6 +42,8 @@ def layout_of(P: Any, layout: Any) -> str:
         raise BadInput(f"{shown(layout)} is unknown; {KNOWN}", "layout")
     if isinstance(P, str | os.PathLike):
         return "drn"
+    if hasattr(P, "unwrapped"):
+        raise BadInput("this is an environment; give its table, env.unwrapped.P", "P")
     if isinstance(P, Mapping):
         return "gymnasium"
     if is_sparse(P) or _is_triple(P):
