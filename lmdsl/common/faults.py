@@ -105,6 +105,9 @@ def _plain(value: Any) -> Any:
 def _unknown(where: str, location: tuple[int | str, ...], model: type[BaseModel]) -> _Fault:
     allowed = sorted({key for kind in _models(model, location[:-1]) for key in kind.model_fields})
     near = spelling.nearest(str(location[-1]), allowed, spelling.KEYS)
+    if near is None and location[-2:-1] in (("<a>",), ("<b>",)):  # of two forms, the other one
+        other = {key for kind in _models(model, location[:-2]) for key in kind.model_fields}
+        near = spelling.nearest(str(location[-1]), other - {location[-1]}, spelling.KEYS)
     if near is None:
         known = f" (known keys: {', '.join(allowed)})" if allowed else ""
         return _Fault(where, f"unknown key; remove it or correct its spelling{known}")

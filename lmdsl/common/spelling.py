@@ -68,7 +68,8 @@ KEYS: Final[Mapping[str, str]] = {
     "maximum": "high", "upper": "high", "ub": "high", "to": "high", "n": "cells", "bins": "cells",
     "resolution": "cells", "num": "points", "count": "points", "circular": "periodic",
     "wrap": "periodic", "wraps": "periodic", "angle": "periodic", "sigma": "std",
-    "stddev": "std", "probabilities": "weights", "probs": "weights", "condition": "where",
+    "gaussian": "normal", "gauss": "normal", "stddev": "std",
+    "probabilities": "weights", "probs": "weights", "condition": "where",
     "if": "where", "set": "where", "type": "kind",
 }  # fmt: skip
 
