@@ -20,7 +20,7 @@ def add(command: Command) -> None:
 
 
 def _schema(parsed: Arguments) -> int:
-    from lmdsl.problem.problem import json_schema
+    from lmdsl.problem import json_schema
 
     print_json(json_schema(), indent=2)
     return 0

@@ -144,7 +144,11 @@ def simulate(
     if not len(cells) or not weight.any():
         raise BadInput("there is no stabilizable cell to start from")
     x = draw_starts(loop.partition, cells, weight, starts, rng)
-    outcome, taken, arrived = loop.run(x, steps, rng, deadline)
+    held = None
+    with loop.true_map.helped():
+        outcome, taken, arrived = loop.run(x, steps, rng, deadline)
+        if loop.controller.local is not None:
+            held = loop.hold(arrived, hold, rng, deadline)
     reached = int((outcome == REACHED).sum())
     made = int(taken.max())
     cycling = int((outcome == CYCLING).sum())
@@ -159,7 +163,7 @@ def simulate(
         cycling=cycling,
         steps=quantiles,
         interval=clopper_pearson(reached, starts),
-        held=None if loop.controller.local is None else loop.hold(arrived, hold, rng, deadline),
+        held=held,
         steps_made=made,
         cut=bool(cycling) and made < steps,
         aimed=not loop.problem.attractor.empty,

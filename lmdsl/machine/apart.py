@@ -83,7 +83,7 @@ def call(
 def serve() -> None:
     """Do the work of the child: read a call from standard input, write what it returns."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the caller ends us
-    _end_with_the_caller()
+    end_with_the_caller()
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a library prints is no reply
     function, arguments = pickle.load(sys.stdin.buffer)
@@ -96,7 +96,7 @@ def serve() -> None:
     replies.flush()
 
 
-def _end_with_the_caller() -> None:
+def end_with_the_caller() -> None:
     """Ask Linux to end us when whoever started us is killed."""
     with contextlib.suppress(Exception):
         import ctypes

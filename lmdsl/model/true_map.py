@@ -1,6 +1,7 @@
 """The true map x+ = T(x, u, w) of a problem, and the states and cells that its images become."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ from lmdsl.formulas.enclosures import Jet
 from lmdsl.model.grid.partition import Partition
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.base import StateMap
+from lmdsl.systems.black_box.function_map import FunctionMap
 
 
 class TrueMap:
@@ -42,6 +44,10 @@ class TrueMap:
     ) -> tuple[Floats, ...]:
         """Return the images by axis, not wrapped, each in the shape of what it depends on."""
         return self.map(self.named(x, u, w), guard)
+
+    def helped(self) -> AbstractContextManager[None]:
+        """Keep ready what helps with many calls of a user's function."""
+        return self.map.helped() if isinstance(self.map, FunctionMap) else nullcontext()
 
     def enclose(
         self, x: Sequence[Jet], u: Sequence[Jet], w: Sequence[Jet], guard: Guard | None = None

@@ -7,11 +7,19 @@ from lmdsl.common import spelling
 from lmdsl.errors import BadInput, shown
 from lmdsl.problem import endings
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
-from lmdsl.systems import OdeSystem
+from lmdsl.systems import MatrixSystem, OdeSystem
 from lmdsl.systems.named import NamedOde
 
 if TYPE_CHECKING:
     from lmdsl.problem.problem import Problem
+
+
+def require_writable(problem: "Problem") -> None:
+    """Refuse a problem that no file can hold."""
+    for key in problem.functions:
+        raise BadInput("a FunctionSystem or function cannot be written; use formulas", key)
+    if isinstance(problem.system, MatrixSystem):
+        raise BadInput("a file holds no matrices; save the result of solving it", "system")
 
 
 def require_consistent(problem: "Problem") -> None:

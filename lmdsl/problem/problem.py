@@ -20,15 +20,16 @@ from lmdsl.formulas.names import FormulaText, Let
 from lmdsl.formulas.program import Program
 from lmdsl.problem import endings
 from lmdsl.problem.axes import StateBox
-from lmdsl.problem.consistency import require_consistent
+from lmdsl.problem.consistency import require_consistent, require_writable
 from lmdsl.problem.controls import ControlGrid
 from lmdsl.problem.local_control import LocalUnion
 from lmdsl.problem.noise import Noise
 from lmdsl.problem.sampling import SamplingUnion
 from lmdsl.problem.sets import REACHED_OR_ENDED, Attractor, Avoid, Measure
 from lmdsl.problem.unions import SystemUnion
-from lmdsl.systems import FunctionSystem, MatrixSystem, System
+from lmdsl.systems import FunctionSystem, System
 from lmdsl.systems.base import Judged, StateMap
+from lmdsl.systems.black_box.cost import StageCost, cost_map
 from lmdsl.systems.runge_kutta import RungeKutta
 
 
@@ -50,7 +51,8 @@ class Problem(Declared):
     admissible
         Condition in states and controls without which a pair is inadmissible.
     stage_cost
-        Formula G(x, u, w), finite and >= 0.
+        Formula G(x, u, w), finite and >= 0; or a Python function, called as a function system is,
+        with those of the variables and parameters that it names.
     cost_rate
         Instead, for a differential equation: a formula whose integral along the step is the cost.
     terminal_cost
@@ -82,7 +84,7 @@ class Problem(Declared):
     control_grid: ControlGrid
     admissible: FormulaText | None = None
     noise: Noise | None = None
-    stage_cost: FormulaText | None = None
+    stage_cost: StageCost | None = None
     cost_rate: FormulaText | None = None
     terminal_cost: FormulaText | None = None
     sampling: SamplingUnion
@@ -106,7 +108,7 @@ class Problem(Declared):
     def _consistent(self) -> Self:
         require_consistent(self)
         self.step()
-        self.cost()
+        self.stage() or self.cost()
         self.terminal()
         self.density()
         self.admitted()
@@ -211,14 +213,24 @@ class Problem(Declared):
         rate = None if self.cost_rate is None else self.cost()
         return system.flow(self.states, self.controls, self.noises, rate, self.definitions())
 
+    @property
+    def functions(self) -> tuple[str, ...]:
+        """The keys that are Python functions, which no file holds."""
+        own = ("system",) * isinstance(self.system, FunctionSystem)
+        return own + ("stage_cost",) * callable(self.stage_cost)
+
     def cost(self) -> Formula:
-        """Return the parsed stage cost, or cost rate."""
+        """Return the parsed stage cost, or cost rate; a Python function is none."""
         if self.cost_rate is not None:
             return self.formula(self.cost_rate, "cost_rate")
+        if callable(self.stage_cost):
+            raise BadInput("a Python function is no formula; use stage()", "stage_cost")
         return self.formula(str(self.stage_cost), "stage_cost")
 
-    def stage(self) -> Program | None:
+    def stage(self) -> StateMap | None:
         """Return the stage cost of named arrays; None where a cost rate stands for it."""
+        if callable(self.stage_cost):
+            return cost_map(self.stage_cost, self)
         return None if self.cost_rate else Program([self.cost()], self.system.constants())
 
     def terminal(self) -> Formula | None:
@@ -262,14 +274,9 @@ class Problem(Declared):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the problem as plain data that ``json.dumps`` accepts, defaults written out."""
-        if isinstance(self.system, FunctionSystem):
-            raise BadInput("a FunctionSystem cannot be written to a file; use formulas", "system")
-        if isinstance(self.system, MatrixSystem):
-            raise BadInput("a file holds no matrices; save the result of solving it", "system")
+        require_writable(self)
         data = self.model_dump(mode="json", exclude_none=True)
-        for key in ("system", "sampling", "local_controller"):
-            if key not in data:
-                continue
+        for key in {"system", "sampling", "local_controller"} & data.keys():
             data[key] = {"kind": data[key]["kind"], **data[key]}  # kind first, for people
         return data
 
@@ -310,11 +317,3 @@ def parse_problem(data: Any) -> Problem:
         raise BadInput('required key is missing; add "format": "lmdsl/1"', "format")
     problem: Problem = Problem.model_validate(data)
     return problem
-
-
-def json_schema() -> dict[str, Any]:
-    """Return the JSON Schema of the problem file, made from the models themselves."""
-    schema = Problem.model_json_schema()
-    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-    schema["title"] = "lmdsl problem file"
-    return schema

@@ -31,6 +31,7 @@ from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory import archive
 from lmdsl.results.directory.audit import (
+    NOT_EVALUATED,
     differences,
     function_differences,
     local_differences,
@@ -38,7 +39,7 @@ from lmdsl.results.directory.audit import (
 )
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
-from lmdsl.systems import FunctionSystem, MatrixSystem
+from lmdsl.systems import MatrixSystem
 
 Judge = Callable[[StabilizationLP, Witness, float], Certificate]
 
@@ -147,11 +148,11 @@ def verify(
     ]
     lp = whole = recompiled(path, result, progress, deadline)
     in_time()
-    if isinstance(result.problem.system, FunctionSystem):
+    functions = result.problem.functions
+    if functions:
         reasons += function_differences(lp, result)
-        about = "the system is a Python function, which was not re-evaluated: its saved rows"
-        notes.insert(0, f"{about} were checked")
-        if result.local_controller is not None:
+        notes.insert(0, NOT_EVALUATED[functions])
+        if "system" in functions and result.local_controller is not None:
             notes.append("what the local controller does was not checked")
         if (result.cell_status == CellStatus.BEYOND_GAMMA).any():
             notes.append("that gamma is infeasible from the cells left out was not checked")
@@ -196,10 +197,17 @@ def recompiled(
     progress: Progress | None = None,
     time_limit: float | Deadline | None = None,
 ) -> StabilizationLP:
-    """Return the finite model of a directory made anew; of a Python function, its saved rows."""
-    if isinstance(result.problem.system, FunctionSystem):
+    """Return the finite model of a directory made anew; of Python functions, what they gave."""
+    problem = result.problem
+    if "system" in problem.functions:
         return _stored_model(path, result)
-    return compile(result.problem, progress, time_limit)
+    if not problem.functions:
+        return compile(problem, progress, time_limit)
+    lp = compile(problem.replaced(stage_cost="0"), progress, time_limit)
+    cost = archive.read_model(path, result, {"cost": ((lp.K,), "<f8")})["cost"]
+    if not (np.isfinite(cost) & (cost >= 0)).all():
+        raise BadInput("the saved costs are inconsistent", "model.npz")
+    return replace(lp, problem=problem, cost=cost)
 
 
 def _judge_claims(

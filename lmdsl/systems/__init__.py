@@ -7,6 +7,8 @@ from lmdsl.systems.function import FunctionSystem as FunctionSystem
 from lmdsl.systems.matrices.data import DataSystem as DataSystem
 from lmdsl.systems.matrices.system import MatrixSystem as MatrixSystem
 from lmdsl.systems.named import NamedSystem as NamedSystem
+from lmdsl.systems.translated.casadi_systems import from_casadi as from_casadi
+from lmdsl.systems.translated.sympy_systems import from_sympy as from_sympy
 
 # A line for each system known by name, in the order in which they are listed.
 # isort: off

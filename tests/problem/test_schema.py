@@ -18,7 +18,8 @@ from spoiled_files import spoiled_file
 
 import lmdsl as lm
 from lmdsl.common.files import strict_json
-from lmdsl.problem.problem import json_schema, parse_problem
+from lmdsl.problem import json_schema
+from lmdsl.problem.problem import parse_problem
 
 WORDS = {
     "$defs", "$ref", "$schema", "additionalProperties", "allOf",

@@ -11,7 +11,8 @@ from problems import made, standard_map, steps
 
 import lmdsl as lm
 from lmdsl.systems import FunctionSystem
-from lmdsl.systems.function import FunctionMap
+from lmdsl.systems.black_box.function_map import FunctionMap
+from lmdsl.systems.black_box.returned import Returned
 
 NOISE = {"w": {"values": [-0.01, 0.01], "weights": [0.5, 0.5]}}
 
@@ -282,7 +283,7 @@ def test_images_in_the_same_memory_are_refused():
 
 def test_images_that_change_later_were_copied():
     kept = np.empty(3)
-    step = FunctionMap(lambda x: {"x": np.multiply(x, 2, out=kept)}, ("x",), {})
+    step = FunctionMap(lambda x: {"x": np.multiply(x, 2, out=kept)}, Returned(("x",), "next"), {})
     (first,) = step({"x": np.ones(3)})
     step({"x": np.zeros(3)})
     assert first.tolist() == [2, 2, 2]

@@ -101,7 +101,9 @@ def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
     N = math.prod(axis.cells for axis in problem.state_box.values())
     lanes = N * discretization.control_count(problem)
     samples = discretization.sample_points(problem) * discretization.node_count(problem)
-    step, cost = problem.step(), Program([problem.cost()], problem.system.constants())
+    step, cost = problem.step(), problem.stage()
+    if cost is None:  # a rate, of the same names
+        cost = Program([problem.cost()], problem.system.constants())
     calls = 2 + 2 * lanes * min(samples, CHUNK) // CHUNK
     locating = SAMPLE * (1 + path_doubles(problem) // 8)
     work = lanes * samples * (locating + step.work + cost.work)

@@ -17,6 +17,7 @@ from lmdsl.formulas.program import Program
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import fixed
 from lmdsl.model import discretization
+from lmdsl.model.assembly.asked import Asked
 from lmdsl.model.assembly.entries import Entries, path_doubles
 from lmdsl.model.assembly.lines import Lines
 from lmdsl.model.assembly.merging import mean_cost
@@ -26,7 +27,6 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.base import StateMap
-from lmdsl.systems.function import Audit, FunctionMap
 
 # Number of samples at a time: few enough to stay in cache, many enough to keep threads apart.
 CHUNK = 2**17
@@ -77,6 +77,10 @@ class Sampler:
         Number of samples S of a pair; sample s is point ``s // nodes`` and node ``s % nodes``.
     controls
         Control vectors, shape (M, p).
+    chunk
+        Number of samples at a time.
+    asked
+        The user's own functions among the map and the cost.
     guard
         Raises once the deadline has passed.
     true_map
@@ -107,12 +111,11 @@ class Sampler:
         step, cost = _written(problem, self.true_map.map), problem.stage()
         self.step = partial(step, guard=guard)
         self.cost = None if cost is None else partial(cost, guard=guard)
-        self.chunk = chunk(problem)
+        self.chunk, self.asked = chunk(problem), Asked(step, cost)
         self._entries = Entries.of(problem, partition, sets)
         self._images, self._costs = None, None
         if self._entries is None:
             self._images, self._costs = _split(problem, step, cost)
-        self._audit: Audit | None = None
         self._offset = np.ascontiguousarray(self.points.T)[:, :, None]
         self._control = np.ascontiguousarray(self.controls.T)
         self._noise = np.ascontiguousarray(self.nodes.values.T)[:, None, None, :, None]
@@ -141,19 +144,19 @@ class Sampler:
         controls = u[:, :, None, None, None] if cells_last else u[:, None, None, None, :]
         return self.true_map.named(states, list(controls), list(self._noise))
 
-    def audit(self, cells: Indices) -> Audit | None:
-        """Ask a user's function about a few pairs, before all; None for formulas.
+    def audit(self, cells: Indices) -> None:
+        """Ask a user's functions about a few pairs, before all, and how long that takes.
 
         From then on, of every block some samples are asked for again.
         """
-        step = self.step.func
-        if not isinstance(step, FunctionMap) or not len(cells):
-            return None
+        if not self.asked.maps or not len(cells):
+            return
         width = min(len(self.controls), FEW)
         count = max(1, min(len(cells), FEW, CHUNK // (self.samples * width)))
         few = cells[np.linspace(0, len(cells) - 1, count).astype(int)]
-        self._audit = step.audit(self.values(Block(0, few, (0, width))))
-        return self._audit
+        self.asked.audit(self.values(Block(0, few, (0, width))), self.guard)
+        self.chunk = self.asked.chunk(self.chunk)
+        self.asked.announce(len(cells) * len(self.controls) * self.samples)
 
     def outcomes(self, block: Block) -> tuple[Floats, Floats]:
         """Return :meth:`images` and :meth:`costs` of a block."""
@@ -222,7 +225,10 @@ class Sampler:
         return self._by_key(values, ends)
 
     def _by_key(self, values: Mapping[str, Floats], ends: Endings | None) -> dict[str, Floats]:
-        costs = {} if self.cost is None else {"stage_cost": np.asarray(self.cost(values)[0])}
+        costs: dict[str, Floats] = {}
+        if self.cost is not None:
+            (costs["stage_cost"],) = stage = self.cost(values)
+            self.asked.alone(self.cost.func, values, stage)
         if self._entries is not None and ends is not None:
             costs |= self._entries.costs(ends, self.guard)
         return costs
@@ -230,8 +236,7 @@ class Sampler:
     def _step(self, values: Mapping[str, Floats]) -> tuple[Floats, ...]:
         """Return the images; of a user's function some are asked for again."""
         images = self.step(values)
-        if self._audit is not None:
-            self._audit.alone(values, images)
+        self.asked.alone(self.step.func, values, images)
         return images
 
     def _shape(self, block: Block) -> tuple[int, int, int, int]:
@@ -263,17 +268,20 @@ def _written(problem: Problem, step: StateMap) -> StateMap:
 
 
 def _split(
-    problem: Problem, step: StateMap, cost: Program | None
+    problem: Problem, step: StateMap, cost: StateMap | None
 ) -> tuple[Lines | None, Lines | None]:
     """Return how images and costs are made line by line, one and the same for both if possible."""
     if cost is None:
         return None, None
+    costs = Lines.of(cost, problem.controls) if isinstance(cost, Program) else None
     if not isinstance(step, Program):
-        return None, Lines.of(cost, problem.controls)
+        return None, costs
     images = Lines.of(step, problem.controls)
+    if not isinstance(cost, Program):
+        return images, None
     if images is not None:
         joint = Program([*step.formulas, *cost.formulas], problem.system.constants())
         both = Lines.of(joint, problem.controls)
         if both is not None:
             return both, both
-    return images, Lines.of(cost, problem.controls)
+    return images, costs

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Floats, Indices, Progress
 from lmdsl.errors import BadInput
-from lmdsl.machine import memory, threads
+from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.estimates import Pilot, estimate, require_least, unless_short
 from lmdsl.model.assembly.merging import BlockRows, Numbering, merge, merge_one, tile
@@ -66,7 +66,9 @@ def assemble(
         return of_matrices(problem, partition, sets)
     sampler = Sampler(problem, partition, deadline, sets=sets)
     try:
-        return _assembled(problem, sets, sampler, progress, deadline)
+        with sampler.asked.helped():
+            sampler.audit(sets.free)
+            return _assembled(problem, sets, sampler, progress, deadline)
     except BaseException:
         deadline.cancel()  # threads that help may be far from the end of their blocks
         raise
@@ -79,7 +81,6 @@ def _assembled(
     progress: Progress | None,
     deadline: Deadline,
 ) -> Transitions:
-    audit = sampler.audit(sets.free)
     pilot = _pilot(sampler, sets)
     memory.require(estimate(problem, pilot), "estimated from a few cells")
     F, M = len(sets.free), len(sampler.controls)
@@ -97,7 +98,7 @@ def _assembled(
     # unless it has seen more than that freed at once.
     np.empty(2**20)
     assembler, parts = _Assembler(sampler, sets, shares), sampler.blocks(sets.free)
-    for block, rows in threads.in_order(assembler, parts, deadline.cancel):
+    for block, rows in sampler.asked.in_order(assembler, parts, deadline.cancel):
         pair_pointer[1 + block.first : 1 + block.first + len(block.cells)] += rows.per_cell
         pointer.append(rows.end + target.used)
         control.append(rows.control)
@@ -107,9 +108,8 @@ def _assembled(
         done += block.lanes
         deadline.raise_if_over("compiling")
         if progress:
-            progress("transitions", done / (F * M))
-    if audit is not None:
-        audit.again()
+            progress(sampler.asked.stage(done / (F * M)), done / (F * M))
+    sampler.asked.again()
     return Transitions(
         sets=sets,
         pair_pointer=np.cumsum(pair_pointer, out=pair_pointer),
@@ -189,9 +189,9 @@ def _pilot(sampler: Sampler, sets: CellSets) -> Pilot:
     if not len(sets.free):
         return Pilot()
     F, M, S = len(sets.free), len(sampler.controls), sampler.samples
-    count = min(64, F)
+    count = max(1, min(64, F, 4 * sampler.chunk // S))
     cells = sets.free[np.linspace(0, F - 1, count).astype(int)]
-    width = max(1, min(M, 4 * CHUNK // (count * S)))
+    width = max(1, min(M, 4 * sampler.chunk // (count * S)))
     blocks = [Block(0, cells, (0, M))]
     if width < M:  # another part of the controls for every cell
         starts = np.linspace(0, M - width, count).astype(int).tolist()

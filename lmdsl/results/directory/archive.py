@@ -1,8 +1,8 @@
 """Results as directories: what each file says, written and read.
 
-A directory holds problem.json, certificate.json and solution.npz; for a system written in Python
-also model.npz, the compiled rows, and for a finite model its matrices. Arrays are accepted only
-with the shape and type the problem implies.
+A directory holds problem.json, certificate.json and solution.npz; for a system or a stage cost
+written in Python also model.npz, the compiled rows, and for a finite model its matrices. Arrays are
+accepted only with the shape and type the problem implies.
 """
 
 import contextlib
@@ -34,6 +34,7 @@ from lmdsl.results.directory.certificate_file import CertificateFile, scope
 from lmdsl.results.directory.reading import FORMAT, Reading
 from lmdsl.results.result import ARRAYS, Result
 from lmdsl.systems import NAMED, DataSystem, FunctionSystem, MatrixSystem, System
+from lmdsl.systems.black_box.cost import FUNCTION
 from lmdsl.systems.matrices.rows import MOST_LIMBS, GivenRows
 from lmdsl.systems.named import NamedOde, NotStored
 
@@ -83,7 +84,7 @@ def rescue(result: Result, path: str | os.PathLike[str]) -> Path | None:
 def _contents(result: Result) -> dict[str, bytes]:
     """Return the files of a result but its certificate."""
     problem, contents = result.problem, {}
-    if isinstance(problem.system, FunctionSystem):
+    if problem.functions:
         data = _function_problem(problem)
         if result.lp is None:
             raise BadInput(
@@ -129,7 +130,7 @@ def identity(lp: StabilizationLP) -> str:
     The rows of a Python function cannot be made anew from another problem: its digest is also of
     all that the problem says, but the name.
     """
-    if not isinstance(lp.problem.system, FunctionSystem):
+    if not lp.problem.functions:
         return lp.digest
     said = {**_function_problem(lp.problem), "name": "", "model_sha256": lp.digest}
     return hashlib.sha256(reading.text(said)).hexdigest()
@@ -245,21 +246,27 @@ def _result(
 
 
 def _problem(data: Any, files: Reading) -> Problem:
-    system = data.get("system") if isinstance(data, dict) else None
-    if not isinstance(system, dict):
+    """Return the problem of a directory, with what its file leaves out."""
+    if not isinstance(data, dict):
         return parse_problem(data)
-    kind = str(system.get("kind"))
+    held, system = {**data}, data.get("system")
+    # A function cannot be stored: everything but calling it still works.
+    if data.get("stage_cost") == FUNCTION:
+        held["stage_cost"] = _not_stored
+    if isinstance(system, dict):
+        held["system"] = _system(system, str(system.get("kind")), files)
+    return parse_problem(held)
+
+
+def _system(system: dict[str, Any], kind: str, files: Reading) -> Any:
+    if kind == "function":
+        return FunctionSystem(next=_not_stored, parameters=system.get("parameters", {}))
+    if kind in GIVEN:
+        return _matrices(GIVEN[kind], system, files)
     if "judged" not in system and (kind == "ode" or issubclass(NAMED.get(kind, System), NamedOde)):
         # Saved before paths were judged: the files mean what they meant.
-        return parse_problem({**data, "system": {**system, "judged": "endpoint"}})
-    if kind in GIVEN:
-        stand_in: System = _matrices(GIVEN[kind], system, files)
-    elif kind == "function":  # it cannot be stored: everything but calling it still works
-        stand_in = FunctionSystem(next=_not_stored, parameters=system.get("parameters", {}))
-    else:
-        return parse_problem(data)
-    problem: Problem = Problem.model_validate({**data, "system": stand_in})
-    return problem
+        return {**system, "judged": "endpoint"}
+    return system
 
 
 def _matrices(model: type[MatrixSystem], system: dict[str, Any], files: Reading) -> MatrixSystem:

@@ -1,0 +1,1 @@
+"""Systems of other tools, translated to formulas where the language allows."""
