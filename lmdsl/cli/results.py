@@ -27,6 +27,8 @@ def add(command: Command) -> None:
     simulate.add_argument("--seed", type=int, default=0, metavar="S")
     simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
                           help="with a local controller, steps after reaching A")  # fmt: skip
+    simulate.add_argument("--as-compiled", action="store_true",
+                          help="follow the compiled steps and noise nodes")  # fmt: skip
     shared(simulate, "--time-limit", "--json")
 
     plot = command("plot", _plot, "Draw the figures of a saved result.")
@@ -59,8 +61,9 @@ def _simulate(parsed: Arguments) -> int:
     with ProgressLine() as progress:
         progress("simulate", -1.0)
         runs = result.simulate(
-            parsed.starts, parsed.steps, parsed.seed, parsed.hold, parsed.time_limit
-        )
+            parsed.starts, parsed.steps, parsed.seed, parsed.hold, parsed.time_limit,
+            as_compiled=parsed.as_compiled,
+        )  # fmt: skip
     if parsed.json:
         print_json(runs.to_dict())
         print(f"lmdsl: {AS_STORED}", file=sys.stderr)

@@ -162,6 +162,8 @@ def _summary(result: Any) -> str:
     rows += about
     if result.local_controller:
         rows.append(("local", result.local_controller.sentence()))
+    if result.integration_error:
+        rows.append(("integration", result.integration_error.sentence()))
     if result.gamma_bar:
         rows.append(("gamma_bar", "{:.9g} to {:.9g}".format(*result.gamma_bar)))
     stages = (("compile", seconds.compile), ("solve", seconds.solve), ("verify", seconds.verify))

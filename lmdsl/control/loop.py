@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,10 +10,13 @@ from numpy.typing import ArrayLike
 from lmdsl.common import inputs
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.control.controller import Controller
+from lmdsl.control.integration import Integrator, Moved
+from lmdsl.control.steps import CompiledSteps, Drawn
 from lmdsl.errors import BadInput
+from lmdsl.formulas.program import Program
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
+from lmdsl.machine.forking import cached_property
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.model.discretization import noise_nodes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
@@ -22,7 +26,7 @@ from lmdsl.systems import MatrixSystem
 from lmdsl.systems.matrices.system import Draws
 
 REACHED, LOST, CYCLING = 0, 1, 2
-
+LOSSES = ("outside", "avoid", "no_control")  # where runs are lost: of the box, or such a cell
 
 FOREVER = Deadline()
 
@@ -51,50 +55,119 @@ class Held:
     distance: tuple[float, float] | None
 
 
-class ClosedLoop:
-    """The true map under a controller: wraps, clips and judges like the compiled model.
+class Runs(NamedTuple):
+    """What became of runs.
 
-    Of a finite model the next states are drawn by its rows, and are the centres of their cells.
+    Attributes
+    ----------
+    outcome
+        REACHED, LOST or CYCLING, shape (r,).
+    taken
+        Number of steps, shape (r,).
+    loss
+        Of the lost, an index of LOSSES, shape (r,).
+    cost
+        Sum over the steps of their costs, weighed by the powers of gamma (and of the discount),
+        shape (r,).
+    arrived
+        States in which the runs that reached A entered it, in no particular order, shape (., d).
     """
 
-    def __init__(self, problem: Problem, controller: Controller, status: Statuses) -> None:
+    outcome: Indices
+    taken: Indices
+    loss: Indices
+    cost: Floats
+    arrived: Floats
+
+
+class ClosedLoop:
+    """The true map under a controller: wraps, clips and judges as the problem says.
+
+    Of a finite model the next states are drawn by its rows, and are the centres of their cells.
+    Differential equations are integrated accurately and judged all along their path, and noise is
+    drawn from its distribution; :attr:`compiled` follows the compiled step and its noise nodes.
+    """
+
+    def __init__(
+        self, problem: Problem, controller: Controller, status: Statuses, as_compiled: bool = False
+    ) -> None:
         self.problem, self.controller, self.status = problem, controller, status
-        self.partition = controller.partition
+        self.as_compiled, self.partition = as_compiled, controller.partition
         self.true_map = TrueMap(problem, self.partition)
-        self.nodes = noise_nodes(problem)
         system = problem.system
         self.draws = Draws(system.rows) if isinstance(system, MatrixSystem) else None
-        self.probability = self.nodes.weights / self.nodes.weights.sum()
+        self.noise = Drawn(problem, as_compiled)
+        self.weight = problem.gamma * (problem.discount or 1.0)
+        self._stage, terminal = problem.stage(), problem.terminal()
+        self._terminal: Program | None = None
+        if terminal is not None:
+            self._terminal = Program([terminal], problem.system.constants())
+
+    @cached_property
+    def compiled(self) -> "ClosedLoop":
+        """The same by the compiled step and its noise nodes."""
+        if self.as_compiled:
+            return self
+        return ClosedLoop(self.problem, self.controller, self.status, True)
+
+    @cached_property
+    def steps(self) -> Integrator | CompiledSteps:
+        """What makes the steps."""
+        if self.as_compiled or self.problem.flow() is None:
+            return CompiledSteps(self.true_map)
+        return Integrator(self.problem, self.partition, self.status)
+
+    @property
+    def method(self) -> str:
+        """What is followed, in words."""
+        return "as compiled: " * self.as_compiled + self.steps.method
 
     def step(
         self, x: Floats, cell: Indices, rng: np.random.Generator, deadline: Deadline = FOREVER
     ) -> tuple[Floats, Indices]:
-        """Return the next states, shape (r, d), and their cells, -1 outside the box."""
-        if self.draws is not None:
-            deadline.raise_if_over("simulating")
-            index = self.controller.index[cell].astype(np.int64)
-            after = self.draws(cell, np.where(cell >= 0, index, -1), rng)
-            return self.partition.centres(np.maximum(after, 0)), after
-        u = self.controller.at(cell, x)
-        noise: list[Floats] = []
-        if self.problem.noises:
-            node = rng.choice(len(self.probability), size=len(x), p=self.probability)
-            noise = list(self.nodes.values[node].T)
-        return self.true_map.step(x, u, noise, partial(deadline.raise_if_over, "simulating"))
+        """Return the next states, shape (r, d), and their cells, -1 outside the box.
+
+        A path that enters A or avoid, or leaves the box, ends there.
+        """
+        moved = self.move(x, cell, rng, deadline)
+        return moved.state, moved.cell
+
+    def move(
+        self,
+        x: Floats,
+        cell: Indices,
+        rng: np.random.Generator,
+        deadline: Deadline = FOREVER,
+        absorb: bool = True,
+        pieces: int = 0,
+    ) -> Moved:
+        """Make a step; see :meth:`Integrator.move`. Its cost is without the terminal cost."""
+        u, w = self.controller.at(cell, x), self.noise(rng, len(x))
+        guard = partial(deadline.raise_if_over, "simulating")
+        if self.draws is None:
+            moved = self.steps.move(x, u, w, guard, absorb, pieces)
+        else:
+            guard()
+            index = np.where(cell >= 0, self.controller.index[cell], -1).astype(np.int64)
+            after = self.draws(cell, index, rng)
+            place = self.partition.centres(np.maximum(after, 0))
+            moved = Moved(place, after, self.draws.costs(cell, index), np.zeros((0, *x.shape)))
+        if self._stage is None:
+            return moved
+        named = self.true_map.named(list(x.T), list(u.T), w)
+        given = 0.0 if self.draws is None else moved.cost
+        return moved._replace(cost=given + np.broadcast_to(self._stage(named, guard)[0], len(x)))
 
     def run(
         self, x: Floats, steps: int, rng: np.random.Generator, deadline: Deadline = FOREVER
-    ) -> tuple[Indices, Indices, Floats]:
-        """Run from states until A, loss, the step limit, or the deadline.
-
-        Returns outcome and number of steps of each run, and the states, in no particular order, in
-        which the runs that reached A entered it.
-        """
+    ) -> Runs:
+        """Run from states until A, loss, the step limit, or the deadline."""
         x, cell = self.partition.enter(x)
         arrived = [x[:0]]
         outcome = np.full(len(x), CYCLING, dtype=np.int64)
         taken = np.full(len(x), steps, dtype=np.int64)
-        active = np.arange(len(x))
+        loss, cost = np.zeros(len(x), dtype=np.int64), np.zeros(len(x))
+        active, power = np.arange(len(x)), 1.0
         for n in range(steps + 1):
             state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
             for code, ended in (
@@ -105,16 +178,33 @@ class ClosedLoop:
                 taken[active[ended]] = n
                 if code == REACHED:
                     arrived.append(x[ended])
+                    cost[active[ended]] += (power * self._paid(x[ended])) if n else 0.0
+                else:
+                    loss[active[ended]] = _losses(cell[ended], state[ended])
             on = state == CellStatus.STABILIZED
             active, x, cell = active[on], x[on], cell[on]
             taken[active] = n
             if n == steps or not len(active) or deadline():
                 break
             try:
-                x, cell = self.step(x, cell, rng, deadline)
+                moved = self.move(x, cell, rng, deadline)
             except TimeLimitReached:
                 break
-        return outcome, taken, np.concatenate(arrived)
+            x, cell = moved.state, moved.cell
+            with np.errstate(all="ignore"):
+                cost[active] += power * moved.cost
+                power *= self.weight
+        return Runs(outcome, taken, loss, cost, np.concatenate(arrived))
+
+    def _paid(self, x: Floats) -> Floats:
+        """Return the terminal costs of states in A, shape (r,)."""
+        system, missed = self.problem.system, 0.0
+        if isinstance(system, MatrixSystem):
+            missed = system.missed(self.problem.gamma, self.problem.discount)
+        if self._terminal is None:
+            return np.full(len(x), missed)
+        named = dict(zip(self.partition.names, x.T, strict=True))
+        return missed + np.broadcast_to(self._terminal(named)[0], len(x))
 
     def hold(
         self, x: Floats, steps: int, rng: np.random.Generator, deadline: Deadline = FOREVER
@@ -127,10 +217,11 @@ class ClosedLoop:
         stayed = np.ones(runs, dtype=np.bool_)
         for n in range(steps):
             try:
-                x, cell = self.step(x, cell, rng, deadline)
+                moved = self.move(x, cell, rng, deadline, absorb=False)
             except TimeLimitReached:
                 steps = n
                 break
+            x, cell = moved.state, moved.cell
             state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
             on = state <= CellStatus.STABILIZED
             stayed = (stayed & (state == CellStatus.ATTRACTOR))[on]
@@ -153,8 +244,10 @@ class ClosedLoop:
         )
 
     @own_arithmetic
-    def path(self, x: ArrayLike, steps: int, seed: int = 0) -> Floats:
+    def path(self, x: ArrayLike, steps: int, seed: int = 0, *, as_compiled: bool = False) -> Floats:
         """Return the states of one run, shape (steps taken + 1, d), ending in A or with a loss."""
+        if inputs.flag(as_compiled, "as_compiled") and not self.as_compiled:
+            return self.compiled.path(x, steps, seed)
         start, steps = inputs.states(x, self.partition.names, "x"), inputs.whole(steps, "steps", 0)
         if start.size != self.partition.dimension or not np.isfinite(start).all():
             raise BadInput("a path starts in one state of finite numbers", "x")
@@ -165,6 +258,11 @@ class ClosedLoop:
             state, cell = self.step(state, cell, rng)
             states.append(state[0])
         return np.array(states)
+
+
+def _losses(cell: Indices, state: Statuses) -> Indices:
+    """Return why runs are lost that ended in such cells, as indices of LOSSES."""
+    return np.where(cell < 0, 0, np.where(state == CellStatus.AVOID, 1, 2))
 
 
 def draw_starts(

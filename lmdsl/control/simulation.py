@@ -1,13 +1,14 @@
 """The true map in closed loop: runs, and what became of them."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
-from lmdsl.common.records import Frozen
+from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Floats, Indices
-from lmdsl.control.loop import CYCLING, LOST, REACHED, ClosedLoop, Held, draw_starts
+from lmdsl.control.loop import CYCLING, LOSSES, LOST, REACHED, ClosedLoop, Held, draw_starts
+from lmdsl.control.steps import AS_DECLARED
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
@@ -38,6 +39,13 @@ class Simulation(Frozen):
         The time was up: the runs that had not ended count as cycling.
     aimed
         There is an attractor to reach; else going on for ever is no fault.
+    lost_to
+        The lost by ``outside`` (left the box), ``avoid`` and ``no_control`` (entered such a cell).
+    cost
+        ``mean`` over the reached of what they paid, and its ``standard_error`` (None for one run);
+        None where none reached. To be compared with the certificate's cost where all reach.
+    method
+        What was followed, in words: the map, or how its equation was integrated.
     """
 
     starts: int
@@ -50,14 +58,13 @@ class Simulation(Frozen):
     steps_made: int = 0
     cut: bool = False
     aimed: bool = True
+    lost_to: dict[str, int] = field(default_factory=lambda: dict.fromkeys(LOSSES, 0))
+    cost: dict[str, float | None] | None = None
+    method: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        data = {**asdict(self), "interval": list(self.interval)}
-        del data["aimed"]
-        if self.held is not None and self.held.distance is not None:
-            data["held"]["distance"] = list(self.held.distance)
-        return data
+        return {key: jsonable(value) for key, value in asdict(self).items() if key != "aimed"}
 
     def sentence(self) -> str:
         """Return what became of the runs, and what it means where many did not arrive."""
@@ -83,16 +90,22 @@ class Simulation(Frozen):
             f"{self.starts} runs of the true map from random starts",
             f"  reached the attractor  {self.reached}  ({100 * self.reached / self.starts:.4g} %; "
             f"95 % interval {100 * low:.4g} to {100 * high:.4g} %)",
-            f"  lost                   {self.lost}",
+            f"  lost                   {self.lost}{self._causes()}",
             f"  cycling                {self.cycling}",
         ]
         if not self.aimed:
             lines[1:4] = [lines[2], f"  going on               {self.cycling}  (no target)"]
+        if self.method != AS_DECLARED:
+            lines.insert(1, f"  followed               {self.method}")
         if self.cut:
             lines[-1] += f"  (or cut off by the time limit after {self.steps_made} steps)"
         if self.steps:
             steps = ", ".join(f"{k} {v}" for k, v in self.steps.items())
             lines.append(f"  steps                  {steps}")
+        if self.cost:
+            mean, error = self.cost["mean"], self.cost["standard_error"]
+            spread = "" if error is None else f" +- {error:.2g} (standard error)"
+            lines.append(f"  cost of the reached    {mean:.6g}{spread}")
         if self.held:
             held = self.held
             lines += [
@@ -110,6 +123,12 @@ class Simulation(Frozen):
         return "\n".join(lines)
 
     __str__ = text
+
+    def _causes(self) -> str:
+        """Return by what runs were lost, in brackets; empty where none was."""
+        words = {"outside": "left the box", "avoid": "in avoid", "no_control": "without control"}
+        parts = [f"{count} {words[key]}" for key, count in self.lost_to.items() if count]
+        return f"  ({', '.join(parts)})" * bool(parts)
 
 
 def simulate(
@@ -146,9 +165,10 @@ def simulate(
     x = draw_starts(loop.partition, cells, weight, starts, rng)
     held = None
     with loop.true_map.helped():
-        outcome, taken, arrived = loop.run(x, steps, rng, deadline)
+        runs = loop.run(x, steps, rng, deadline)
         if loop.controller.local is not None:
-            held = loop.hold(arrived, hold, rng, deadline)
+            held = loop.hold(runs.arrived, hold, rng, deadline)
+    outcome, taken = runs.outcome, runs.taken
     reached = int((outcome == REACHED).sum())
     made = int(taken.max())
     cycling = int((outcome == CYCLING).sum())
@@ -167,7 +187,21 @@ def simulate(
         steps_made=made,
         cut=bool(cycling) and made < steps,
         aimed=not loop.problem.attractor.empty,
+        lost_to={
+            name: int(((outcome == LOST) & (runs.loss == k)).sum()) for k, name in enumerate(LOSSES)
+        },
+        cost=_mean(runs.cost[outcome == REACHED]),
+        method=loop.method,
     )
+
+
+def _mean(cost: Floats) -> dict[str, float | None] | None:
+    """Return the mean cost of runs and its standard error; None without any."""
+    if not len(cost):
+        return None
+    with np.errstate(all="ignore"):
+        error = float(cost.std(ddof=1) / np.sqrt(len(cost))) if len(cost) > 1 else None
+        return {"mean": float(cost.mean()), "standard_error": error}
 
 
 def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:

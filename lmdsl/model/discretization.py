@@ -14,15 +14,15 @@ NODE = 400  # bytes for each noise node: its values, its weight, and what orders
 
 
 def offsets(problem: Problem) -> Floats:
-    """Return the sample offsets within a cell, shape (points, d), in [0, 1)."""
-    d = len(problem.state_box)
-    memory.require(32 * d * sample_points(problem), "sample points")
-    return problem.sampling.offsets(d)
+    """Return the sample offsets within a cell, shape (points, d), in [0, 1]."""
+    states = problem.states
+    memory.require(32 * len(states) * sample_points(problem), "sample points")
+    return problem.sampling.offsets(states)
 
 
 def sample_points(problem: Problem) -> int:
     """Return the number of sample points per cell without making them."""
-    return problem.sampling.count(len(problem.state_box))
+    return problem.sampling.count(problem.states)
 
 
 def control_values(problem: Problem) -> list[Floats]:

@@ -23,6 +23,7 @@ from lmdsl.machine.kernels import fixed
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model import algorithm_1, stabilizable_set
 from lmdsl.model.assembly.estimates import require_least, unless_short
+from lmdsl.model.assembly.substeps import settled
 from lmdsl.model.assembly.transitions import assemble
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.directions import Directions
@@ -285,6 +286,7 @@ def compile(  # noqa: A001
     """
     deadline = Deadline.of(time_limit)
     inputs.kind(problem, Problem, "problem", "a Problem")
+    problem = settled(problem, deadline)
     partition = Partition.of(problem)
     require_least(problem)
     limit = unless_short(problem, deadline)

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 
 from lmdsl.common import inputs
 from lmdsl.common.types import Floats, Indices
+from lmdsl.control.integration import Integrator
 from lmdsl.control.loop import draw_starts
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
@@ -52,15 +53,22 @@ def control_vector(
 def constant_map(problem: Problem, partition: Partition, fine: bool = False) -> Map:
     """Return the map (x, u) -> x+ on arrays (r, d) and (r, p), noise held at its mean.
 
-    With ``fine`` the map of a differential equation covers 1/PIECES of a step.
+    A differential equation is integrated accurately; with ``fine`` over 1/PIECES of a step.
     """
+    noise = noise_nodes(problem).mean()
+
+    def held(x: Floats) -> list[Floats]:
+        return [np.full(len(x), mean) for mean in noise]
+
+    if not is_ode(problem):
+        true_map = TrueMap(problem, partition)
+        return lambda x, u: true_map.images(x, u, held(x))
     system: Any = problem.system
     if fine:
-        few = -(-system.substeps // PIECES)
-        system = system.model_copy(update={"step": system.step / PIECES, "substeps": few})
+        system = system.model_copy(update={"step": system.step / PIECES})
         problem = problem.model_copy(update={"system": system})
-    true_map, noise = TrueMap(problem, partition), noise_nodes(problem).mean()
-    return lambda x, u: true_map.images(x, u, [np.full(len(x), mean) for mean in noise])
+    integrator = Integrator(problem, partition)
+    return lambda x, u: integrator.images(x, u, held(x))
 
 
 def open_loop(
@@ -122,24 +130,19 @@ def closed_loop(result: Result, x: Floats, steps: int, seed: int) -> tuple[Float
     Returns the states, shape (T, r, d), NaN after the end of a run; the last cell of each run, -1
     outside the box; and the number of states a step.
     """
-    loop, problem, p = result.closed_loop, result.problem, result.partition
-    rng = np.random.default_rng(seed)
-    fine = is_ode(problem) and not problem.noises
-    inner = constant_map(problem, p, fine) if fine else None
+    loop, p = result.closed_loop, result.partition
+    rng, pieces = np.random.default_rng(seed), PIECES if is_ode(result.problem) else 1
     x, cell = p.enter(x)
     points = [x]
     for _ in range(steps):
         on = np.flatnonzero((cell >= 0) & (result.cell_status[cell] == CellStatus.STABILIZED))
         if not len(on):
             break
-        here, state = points[-1][on], cell[on]
-        following, cell[on] = loop.step(here, state, rng)
-        u = loop.controller.at(state, here)
-        for _ in range(PIECES - 1 if inner else 0):
-            here = inner(here, u) if inner else here
-            points.append(_scatter(x, on, p.states(here)))
-        points.append(_scatter(x, on, following))
-    return np.array(points), cell, PIECES if fine else 1
+        moved = loop.move(points[-1][on], cell[on], rng, pieces=pieces - 1)
+        points += [_scatter(x, on, p.states(piece)) for piece in moved.drawn]
+        points.append(_scatter(x, on, moved.state))
+        cell[on] = moved.cell
+    return np.array(points), cell, pieces
 
 
 def _scatter(like: Floats, rows: Indices, values: Floats) -> Floats:

@@ -30,6 +30,7 @@ def require_consistent(problem: "Problem") -> None:
     _one_cost(problem)
     _sets_named(problem)
     _local_named(problem)
+    problem.sampling.check(problem.states)
 
 
 def _unique_names(problem: "Problem") -> None:

@@ -79,8 +79,8 @@ class ControlValues(Declared):
 
 
 ControlUnion = Annotated[
-    Annotated[ControlValues, Tag("<a>")] | Annotated[ControlRange, Tag("<b>")],
-    tag_by_key("values", ControlValues),
+    Annotated[ControlValues, Tag("<values>")] | Annotated[ControlRange, Tag("<other>")],
+    tag_by_key({"values": ControlValues}),
 ]
 
 ControlGrid = Annotated[

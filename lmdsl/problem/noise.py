@@ -6,13 +6,14 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, Tag, model_validator
 
-from lmdsl.common.strict_model import Declared, Numbers, Positive, frozen_dict, plain
+from lmdsl.common.strict_model import Declared, Number, Numbers, Positive, frozen_dict, plain
 from lmdsl.common.types import Floats
 from lmdsl.errors import BadInput
 from lmdsl.formulas.names import named_keys, valid_names
 from lmdsl.problem.unions import EachWords, tag_by_key
 
 MAX_HERMITE = 64  # number of nodes above which a quadrature is refused
+MAX_MIDPOINTS = 1_000
 
 
 class NoiseValues(Declared):
@@ -51,12 +52,31 @@ class NoiseValues(Declared):
         """Return the nodes and their weights, which are not scaled and may be zero."""
         return np.array(self.values), np.array(self.weights)
 
+    def draw(self, rng: np.random.Generator, count: int) -> Floats:
+        """Draw from the distribution, shape (count,)."""
+        values, weights = self.nodes()
+        return rng.choice(values, size=count, p=weights / math.fsum(weights))
+
+    def parts(self) -> tuple[Floats, Floats]:
+        """Return intervals that hold every value that enclosures cover: their ends."""
+        values, weights = self.nodes()
+        return values[weights > 0], values[weights > 0]
+
 
 class Normal(Declared):
-    """A normal distribution of mean 0 by Gauss-Hermite quadrature."""
+    """A normal distribution of mean 0 by Gauss-Hermite quadrature.
+
+    Attributes
+    ----------
+    std, points
+        Standard deviation, and number of nodes.
+    within
+        Standard deviations that enclosures cover beside the nodes.
+    """
 
     std: Positive
     points: Annotated[int, Field(strict=True, ge=1, le=MAX_HERMITE), BeforeValidator(plain)]
+    within: Positive | None = None
 
 
 class NoiseNormal(Declared):
@@ -73,10 +93,63 @@ class NoiseNormal(Declared):
         x, w = np.polynomial.hermite.hermgauss(self.normal.points)
         return math.sqrt(2) * self.normal.std * x, w
 
+    def draw(self, rng: np.random.Generator, count: int) -> Floats:
+        """See :meth:`NoiseValues.draw`."""
+        return self.normal.std * rng.standard_normal(count)
+
+    def parts(self) -> tuple[Floats, Floats]:
+        """See :meth:`NoiseValues.parts`."""
+        nodes, _ = self.nodes()
+        if self.normal.within is None:
+            return nodes, nodes
+        reach = max(float(nodes[-1]), self.normal.within * self.normal.std)
+        ends = np.linspace(-reach, reach, self.normal.points + 1)
+        return ends[:-1], ends[1:]
+
+
+class Uniform(Declared):
+    """A uniform distribution by the midpoints of equal parts."""
+
+    low: Number
+    high: Number
+    points: Annotated[int, Field(strict=True, ge=1, le=MAX_MIDPOINTS), BeforeValidator(plain)]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if not self.low < self.high:
+            raise BadInput(f"{self.low!r} is not below high = {self.high!r}", "low")
+        return self
+
+
+class NoiseUniform(Declared):
+    """A uniformly distributed noise variable."""
+
+    uniform: Uniform
+
+    def count(self) -> int:
+        """See :meth:`NoiseValues.count`."""
+        return self.uniform.points
+
+    def nodes(self) -> tuple[Floats, Floats]:
+        """See :meth:`NoiseValues.nodes`."""
+        low, high, k = self.uniform.low, self.uniform.high, self.uniform.points
+        return low + (np.arange(k) + 0.5) / k * (high - low), np.full(k, 1.0 / k)
+
+    def draw(self, rng: np.random.Generator, count: int) -> Floats:
+        """See :meth:`NoiseValues.draw`."""
+        return rng.uniform(self.uniform.low, self.uniform.high, count)
+
+    def parts(self) -> tuple[Floats, Floats]:
+        """See :meth:`NoiseValues.parts`."""
+        ends = np.linspace(self.uniform.low, self.uniform.high, self.uniform.points + 1)
+        return ends[:-1], ends[1:]
+
 
 NoiseUnion = Annotated[
-    Annotated[NoiseNormal, Tag("<a>")] | Annotated[NoiseValues, Tag("<b>")],
-    tag_by_key("normal", NoiseNormal),
+    Annotated[NoiseNormal, Tag("<normal>")]
+    | Annotated[NoiseUniform, Tag("<uniform>")]
+    | Annotated[NoiseValues, Tag("<other>")],
+    tag_by_key({"normal": NoiseNormal, "uniform": NoiseUniform}),
 ]
 
 Noise = Annotated[

@@ -207,10 +207,10 @@ class Problem(Declared):
         judged: Judged = getattr(self.system, "judged", "endpoint")
         return judged
 
-    def flow(self) -> RungeKutta | None:
-        """Return how the equation, and the cost rate, is integrated; None for a map."""
+    def flow(self, cost: bool = True) -> RungeKutta | None:
+        """Return how the equation, and with it the cost rate, is integrated; None for a map."""
         system: System = self.system
-        rate = None if self.cost_rate is None else self.cost()
+        rate = self.cost() if cost and self.cost_rate is not None else None
         return system.flow(self.states, self.controls, self.noises, rate, self.definitions())
 
     @property

@@ -33,12 +33,14 @@ def _tag_by_kind(value: Any) -> str:
     return f"<{kind}>" if isinstance(kind, str) else "<?>"
 
 
-def tag_by_key(key: str, model: type) -> Any:
-    """Tell a model from another by a key that only it has."""
+def tag_by_key(models: Mapping[str, type]) -> Any:
+    """Tell models from another by a key that only one of them has, tagged ``<key>``."""
 
     def tag(value: Any) -> str:
-        held = isinstance(value, model) or (isinstance(value, Mapping) and key in value)
-        return "<a>" if held else "<b>"
+        for key, model in models.items():
+            if isinstance(value, model) or (isinstance(value, Mapping) and key in value):
+                return f"<{key}>"
+        return "<other>"
 
     return Discriminator(tag)
 

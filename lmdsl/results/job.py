@@ -11,7 +11,8 @@ from lmdsl.certificate.claims import Certificate, Verified, Witness
 from lmdsl.common.types import Floats
 from lmdsl.control.invariance import examine
 from lmdsl.data.report import DataReport
-from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
+from lmdsl.model.assembly.substeps import IntegrationError, integration_error
 from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
@@ -144,6 +145,13 @@ class _Job:
             return f"the controller runs from {cells} to the attractor or the discounted end"
         return f"the controller brings {cells} to the attractor"
 
+    def _integration_error(self) -> IntegrationError | None:
+        """Judge the compiled steps, where there is time."""
+        try:
+            return integration_error(self.lp.problem, deadline=self.finish)
+        except TimeLimitReached:
+            return None
+
     def _result(
         self, witness: Witness, proof: Certificate, status: Status, message: str, **more: Any
     ) -> Result:
@@ -155,11 +163,10 @@ class _Job:
         solved = status != Status.NOT_STABILIZABLE
         attractor = lp.cell_status == CellStatus.ATTRACTOR
         local = LocalController.of(lp.problem, lp.partition, attractor)
-        notes = [message, attractor_note(lp.problem, lp.partition)]
-        data = None
-        if isinstance(lp.problem.system, DataSystem):
-            data = DataReport.of(lp, witness.policy)
-            notes.append(data.sentence())
+        from_data = isinstance(lp.problem.system, DataSystem)
+        data = DataReport.of(lp, witness.policy) if from_data else None
+        error = self._integration_error()
+        said = [data.sentence() if data else "", error.warning() if error else ""]
         return Result(
             status=status,
             backend=self.backend,
@@ -176,8 +183,9 @@ class _Job:
             stabilizable_cells=lp.n,
             local_controller=None if local is None else examine(lp.problem, local, self.finish),
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
-            message="; ".join(note for note in notes if note),
+            message=_together(message, attractor_note(lp.problem, lp.partition), *said),
             data=data,
+            integration_error=error,
             problem=lp.problem,
             partition=lp.partition,
             certificate=proof,
@@ -191,6 +199,10 @@ class _Job:
             lp=lp,
             **more,
         )
+
+
+def _together(*notes: str) -> str:
+    return "; ".join(note for note in notes if note)
 
 
 def _spread(

@@ -250,8 +250,13 @@ class Result(Summary):
         seed: int = 0,
         hold: int = 1_000,
         time_limit: float | None = None,
+        *,
+        as_compiled: bool = False,
     ) -> Simulation:
         """Run the true map under the controller from fresh random starts drawn by m.
+
+        Differential equations are integrated accurately and judged all along their path (unless
+        the problem says ``endpoint``); noise is drawn from its distribution.
 
         Parameters
         ----------
@@ -261,6 +266,8 @@ class Result(Summary):
             With a local controller, steps to run on after the first entry into A.
         time_limit
             Seconds; runs that have not ended by then count as cycling.
+        as_compiled
+            Follow the compiled Runge-Kutta steps, and the noise nodes with their weights, instead.
 
         Raises
         ------
@@ -274,7 +281,9 @@ class Result(Summary):
         cells = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
         weight = self.weight[cells]
         deadline = Deadline.of(time_limit)
-        return simulate(self.closed_loop, cells, weight, starts, steps, seed, hold, deadline)
+        compiled = inputs.flag(as_compiled, "as_compiled")
+        loop = self.closed_loop.compiled if compiled else self.closed_loop
+        return simulate(loop, cells, weight, starts, steps, seed, hold, deadline)
 
     @own_arithmetic
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -10,6 +10,7 @@ from lmdsl.common.types import Statuses
 from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.simulation import Simulation
 from lmdsl.data.report import DataReport
+from lmdsl.model.assembly.substeps import IntegrationError
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.results.status import Status
@@ -89,6 +90,9 @@ class Summary(Frozen):
         Runs of the true map that ``lmdsl solve`` made; None where none was asked for.
     data
         What was recorded, what is assumed and how sure it is; None unless solved from data.
+    integration_error
+        How far the compiled steps are from the differential equation; None for a map, for a loaded
+        result, and where there was no time.
     """
 
     status: Status
@@ -112,16 +116,19 @@ class Summary(Frozen):
     local_controller: LocalCheck | None = None
     simulation: Simulation | None = None
     data: DataReport | None = None
+    integration_error: IntegrationError | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
-        names = [f.name for f in fields(Summary) if f.name not in ("simulation", "data")]
+        later = ("simulation", "data", "integration_error")
+        names = [f.name for f in fields(Summary) if f.name not in later]
         return {
             **{name: jsonable(getattr(self, name)) for name in names},
             "beyond_gamma": jsonable(self.beyond_gamma),
             "coverage": jsonable(self.coverage),
             "simulation": jsonable(self.simulation),
             "data": jsonable(self.data),
+            "integration_error": jsonable(self.integration_error),
         }
 
     @property

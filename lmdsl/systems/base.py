@@ -9,7 +9,7 @@ values.
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from lmdsl.common import spelling
 from lmdsl.common.strict_model import Declared, Positive, plain
@@ -21,7 +21,14 @@ from lmdsl.formulas.names import Formulas, Parameters
 from lmdsl.formulas.program import Program
 from lmdsl.systems.runge_kutta import RungeKutta
 
-Substeps = Annotated[int, Field(strict=True, ge=1, le=1000), BeforeValidator(plain)]
+Substeps = Annotated[
+    Annotated[
+        Annotated[int, Field(strict=True, ge=1, le=1000), BeforeValidator(plain)], Tag("<number>")
+    ]
+    | Annotated[Literal["auto"], Tag("<word>")],
+    Discriminator(lambda value: "<word>" if isinstance(value, str) else "<number>"),
+]
+UNSETTLED = 16  # substeps where as many as it takes are asked for, before these are known
 Judged = Literal["path", "endpoint"]
 
 
@@ -167,7 +174,7 @@ class OdeSystem(System):
     step
         Sampling time: control and noise are held during it. In the units of the derivative.
     substeps
-        RK4 steps per sampling time.
+        RK4 steps per sampling time; ``auto`` is as many as it takes, settled by compiling.
     judged
         ``path``: entering A, avoid or the outside of the box counts on the way as well.
         ``endpoint``: only where a step ends.
@@ -208,4 +215,5 @@ class OdeSystem(System):
         )
         if integrand is not None:
             field = Program([*field.formulas, integrand], self.parameters)
-        return RungeKutta(field, tuple(states), self.step, self.substeps)
+        count = UNSETTLED if self.substeps == "auto" else self.substeps
+        return RungeKutta(field, tuple(states), self.step, count)

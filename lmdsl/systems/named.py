@@ -35,6 +35,8 @@ class NamedSystem(System):
         if cls.problem:
             fields = cls.model_fields.items()
             own = {key: field.default for key, field in fields if key != "judged"}
+            if "substeps" in own:
+                own["substeps"] = "auto"
             system = {**own, "parameters": dict(cls.defaults)}
             cls.problem = {"format": "lmdsl/1", "system": system, **cls.problem}
 
@@ -105,7 +107,7 @@ class NamedOde(NamedSystem):
     step
         Sampling time in seconds (or in the time unit of the equations).
     substeps
-        RK4 steps per sampling time.
+        RK4 steps per sampling time, or ``auto``.
     judged
         See :class:`lmdsl.systems.OdeSystem`.
     """

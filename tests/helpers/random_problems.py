@@ -248,14 +248,20 @@ def _noise(rng: np.random.Generator, names: list[str]) -> Problem:
     return noise
 
 
-def _sampling(rng: np.random.Generator, d: int, most: int) -> Problem:
-    kind = str(rng.choice(["grid", "random", "sobol"]))
+def _sampling(rng: np.random.Generator, names: list[str], most: int) -> Problem:
+    d, kind = len(names), str(rng.choice(["grid", "random", "sobol"]))
+    sampling: Problem = {"kind": kind}
     if kind == "grid":
         largest = max(k for k in range(1, 21) if k**d <= most)
-        return {"kind": kind, "per_axis": int(rng.integers(1, largest + 1))}
-    sampling: Problem = {"kind": kind, "points": int(rng.integers(1, most + 1))}
-    if rng.random() < 0.7:
-        sampling["seed"] = int(rng.integers(0, 1000))
+        sampling["per_axis"] = int(rng.integers(1, largest + 1))
+        if rng.random() < 0.3:
+            sampling["per_axis"] = {k: int(rng.integers(1, largest + 1)) for k in names[::-1]}
+    else:
+        sampling["points"] = int(rng.integers(1, most + 1))
+        if rng.random() < 0.7:
+            sampling["seed"] = int(rng.integers(0, 1000))
+    if 2**d <= most and rng.random() < 0.3:
+        sampling["corners"] = True
     return sampling
 
 
@@ -393,7 +399,7 @@ def _attempt(rng: np.random.Generator) -> Problem:
     nodes = len(noise_nodes(problem))
     pairs = len(control_vectors(problem)) * math.prod(a["cells"] for a in box.values())
     most = min(20 // nodes, max(1, EVALUATIONS // (pairs * nodes * expense)))
-    problem["sampling"] = _sampling(rng, d, max(1, most))
+    problem["sampling"] = _sampling(rng, list(box), max(1, most))
     problem["attractor"] = _attractor(rng, problem, point)
 
     if rng.random() < 0.35:

@@ -316,6 +316,10 @@ def noise_nodes(problem: dict[str, Any]) -> list[tuple[tuple[float, ...], float]
             x, w = np.polynomial.hermite.hermgauss(spec["normal"]["points"])
             values = [math.sqrt(2.0) * spec["normal"]["std"] * float(v) for v in x]
             weights = [float(v) for v in w]
+        elif "uniform" in spec:
+            low, high, k = (spec["uniform"][key] for key in ("low", "high", "points"))
+            values = [low + (i + 0.5) / k * (high - low) for i in range(k)]
+            weights = [1.0 / k] * k
         else:
             values = [float(v) for v in spec["values"]]
             weights = [float(v) for v in spec["weights"]]
@@ -333,19 +337,30 @@ def noise_nodes(problem: dict[str, Any]) -> list[tuple[tuple[float, ...], float]
 
 def sample_offsets(problem: dict[str, Any]) -> list[tuple[float, ...]]:
     """Offsets of the sample points, in cell widths, the same in every cell."""
-    d = len(problem["state_box"])
+    axes = list(problem["state_box"])
     sampling = problem["sampling"]
+    seed = sampling.get("seed", 0)
     if sampling["kind"] == "grid":
         k = sampling["per_axis"]
-        return list(itertools.product([(i + 0.5) / k for i in range(k)], repeat=d))
-    seed = sampling.get("seed", 0)
-    if sampling["kind"] == "random":
-        table = np.random.default_rng(seed).random((sampling["points"], d))
+        each = [k[name] if isinstance(k, dict) else k for name in axes]
+        points = list(itertools.product(*([(i + 0.5) / n for i in range(n)] for n in each)))
+    elif sampling["kind"] == "random":
+        points = np.random.default_rng(seed).random((sampling["points"], len(axes))).tolist()
     else:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # SciPy warns unless the number is a power of two
-            table = qmc.Sobol(d, scramble=True, seed=seed).random(sampling["points"])
-    return [tuple(float(v) for v in row) for row in table]
+            drawn = qmc.Sobol(len(axes), scramble=True, seed=seed).random(sampling["points"])
+        points = drawn.tolist()
+    if sampling.get("corners", False):
+        points += list(itertools.product([0.0, 1.0], repeat=len(axes)))
+    return [tuple(float(v) for v in point) for point in points]
+
+
+def sample_of(axis: Axis, index: int, offset: float) -> float:
+    """Coordinate of a sample point; the upper corner of the last cell is the end of the axis."""
+    if offset == 1 and index == axis.cells - 1:
+        return axis.high
+    return axis.low + (index + offset) * axis.width
 
 
 # ---------------------------------------------------------------------------------------- dynamics
@@ -536,7 +551,7 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
             continue
         corner = unflat(axes, cell)
         samples = [
-            [a.low + (i + o) * a.width for a, i, o in zip(axes, corner, offset, strict=True)]
+            [sample_of(a, i, o) for a, i, o in zip(axes, corner, offset, strict=True)]
             for offset in offsets
         ]
         for number, control in enumerate(controls):

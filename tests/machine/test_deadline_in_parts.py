@@ -73,11 +73,11 @@ def test_a_step_of_the_true_map_is_ended_too():
     loop.run(x, 5, np.random.default_rng(0), whole)
     for count in (1, 30, whole.count // 2):
         late = Asked(count)
-        outcome, taken, arrived = loop.run(x, 5, np.random.default_rng(0), late)
+        runs = loop.run(x, 5, np.random.default_rng(0), late)
         assert late.count <= count + 1
-        assert (outcome == 2).all()
-        assert len(arrived) == 0
-        assert taken.max() < 5
+        assert (runs.outcome == 2).all()
+        assert len(runs.arrived) == 0
+        assert runs.taken.max() < 5
     assert result.simulate(10, time_limit=1e-9).cut
 
 

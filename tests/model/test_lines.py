@@ -73,6 +73,8 @@ def at_endpoints(data):
     """The problem of a named system with steps judged where they end: only these go by lines."""
     kind = lm.systems.NAMED[data["system"]["kind"]]
     judged = {"judged": "endpoint"} if "judged" in kind.model_fields else {}
+    if judged:  # as many as the system takes unasked: few enough to be written out
+        judged["substeps"] = kind.model_fields["substeps"].default
     return lm.Problem.model_validate({**data, "system": {**data["system"], **judged}})
 
 

@@ -191,9 +191,9 @@ def test_starting_points_are_wrapped_too():
         assert path.shape == (1, 1)  # cell 0 is the attractor
         assert 0 <= path[0, 0] <= 1
     assert loop.path([-1e-20], 5)[0, 0] == 1.0
-    runs, taken, _ = loop.run(np.array([[7.8], [1.0], [-0.2]]), 9, np.random.default_rng(0))
-    assert (runs == 0).all()
-    np.testing.assert_array_equal(taken[1], 0)
+    runs = loop.run(np.array([[7.8], [1.0], [-0.2]]), 9, np.random.default_rng(0))
+    assert (runs.outcome == 0).all()
+    assert runs.taken[1] == 0
     np.testing.assert_array_equal(result.controller([[7.3], [0.3]]), np.zeros((2, 0)))
 
 

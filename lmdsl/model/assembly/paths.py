@@ -26,6 +26,10 @@ FAR = 8
 """Distances in cells from what decides a path are told apart up to this one."""
 
 
+NOWHERE = -2
+"""Number of no set of cells: one that no path enters."""
+
+
 class Endings(NamedTuple):
     """What became of samples.
 
@@ -78,7 +82,7 @@ class Ground(NamedTuple):
     number, attractor
         Target of every cell, shape (N,): negative in avoid, ``attractor`` in the attractor.
     room
-        See :func:`_room`.
+        See :func:`free_room`.
     forbid
         Whether leaving the box on the way is an escape.
     """
@@ -101,18 +105,25 @@ class PathJudge:
         The box and its sets.
     endpoint
         Whether only the image is judged.
+    absorb
+        Whether entering the attractor is an event.
     """
 
     def __init__(
-        self, flow: RungeKutta, partition: Partition, sets: CellSets, endpoint: bool
+        self,
+        flow: RungeKutta,
+        partition: Partition,
+        sets: CellSets,
+        endpoint: bool,
+        absorb: bool = True,
     ) -> None:
         self.flow, self.partition, self.endpoint = flow, partition, endpoint
         free = (sets.number >= 0) & ~sets.attractor
         self.ground = Ground(
             np.array(partition.axes, dtype=np.float64),
             sets.number,
-            len(sets.free),
-            _room(free.reshape(partition.shape), partition.periodic),
+            len(sets.free) if absorb else NOWHERE,
+            free_room(free.reshape(partition.shape), partition.periodic),
             not partition.clip,
         )
 
@@ -167,7 +178,7 @@ class PathJudge:
         return cells
 
 
-def _room(free: Bools, periodic: Bools) -> NDArray[np.uint8]:
+def free_room(free: Bools, periodic: Bools) -> NDArray[np.uint8]:
     """Return how near, in cells, something else than a free cell may be to each cell, at most FAR.
 
     Where it is r, the cells less than r away on every axis are free.

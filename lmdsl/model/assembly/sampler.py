@@ -138,7 +138,7 @@ class Sampler:
         index = self.partition.multi_index(block.cells)
         states = []
         for k, offset in enumerate(self._offset):
-            x = self.partition.low[k] + (index[k] + offset) * self.partition.width[k]
+            x = self.partition.place(k, index[k], offset)
             states.append(x[None, :, None, :] if cells_last else x.T.copy()[:, :, None, None])
         u = self._control[:, slice(*block.controls)]
         controls = u[:, :, None, None, None] if cells_last else u[:, None, None, None, :]

@@ -215,9 +215,15 @@ class Partition(Frozen):
     def samples(self, cell: NDArray[np.integer], offsets: Floats) -> list[Floats]:
         """Return the sample points of cells: per axis an array of shape (len(cell), points)."""
         return [
-            self.low[k] + (index[:, None] + offsets[None, :, k]) * self.width[k]
+            self.place(k, index[:, None], offsets[None, :, k])
             for k, index in enumerate(self.multi_index(cell))
         ]
+
+    def place(self, k: int, index: Indices, offset: Floats) -> Floats:
+        """Return low + (index + offset) width on an axis; ``high`` where that is its end."""
+        x = self.low[k] + (index + offset) * self.width[k]
+        last = (offset == 1) & (index == self.cells[k] - 1)
+        return np.asarray(np.where(last, self.high[k], x))
 
     def mask(
         self,

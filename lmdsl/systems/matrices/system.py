@@ -81,6 +81,15 @@ class Draws:
         known = (cell >= 0) & (control >= 0) & (self.key[k] == wanted)
         return np.where(known, self.rows.target[entry], -1).astype(np.int64)
 
+    def costs(self, cell: Indices, control: Indices) -> Floats:
+        """Return the cost of each run's pair; 0 where it has no such pair."""
+        if not len(self.key):
+            return np.zeros(len(cell))
+        wanted = cell * self.rows.controls + control
+        k = np.minimum(np.searchsorted(self.key, wanted), len(self.key) - 1)
+        known = (cell >= 0) & (control >= 0) & (self.key[k] == wanted)
+        return np.where(known, self.rows.cost[k], 0.0)
+
 
 class GivenMap:
     """Stands for the map of a finite model, which has none."""
