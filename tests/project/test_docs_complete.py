@@ -16,7 +16,7 @@ from pages import ROOT, blocks, missing
 import lmdsl as lm
 from lmdsl import backends, cli, plotting
 from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
-from lmdsl.problem import problem
+from lmdsl.problem import json_schema
 from lmdsl.results import comparison
 from lmdsl.results.directory import archive, reading
 from lmdsl.results.status import Status
@@ -60,7 +60,7 @@ def test_no_option_is_invented():
 
 
 def test_every_key_of_the_problem_file_is_described():
-    schema = problem.json_schema()
+    schema = json_schema()
     keys = {key for model in schema["$defs"].values() for key in model.get("properties", {})}
     assert not missing({*keys, *schema["properties"]}, doc("problem-file.md"))
     top = section(doc("problem-file.md"), "## Keys")
