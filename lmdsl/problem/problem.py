@@ -224,7 +224,7 @@ class Problem(Declared):
         if self.cost_rate is not None:
             return self.formula(self.cost_rate, "cost_rate")
         if callable(self.stage_cost):
-            raise BadInput("a Python function is no formula; use stage()", "stage_cost")
+            raise BadInput("a Python function is no formula, which is needed here", "stage_cost")
         return self.formula(str(self.stage_cost), "stage_cost")
 
     def stage(self) -> StateMap | None:

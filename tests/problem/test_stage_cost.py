@@ -114,7 +114,7 @@ def test_no_file_holds_it(tmp_path):
     (tmp_path / "own.json").write_text(json.dumps({**steps(), "stage_cost": {"kind": "function"}}))
     with pytest.raises(lm.BadInput, match="stage_cost"):
         lm.load(tmp_path / "own.json")
-    with pytest.raises(lm.BadInput, match="no formula"):
+    with pytest.raises(lm.BadInput, match="is no formula"):
         own.cost()
     with pytest.raises(lm.BadInput, match=r"stage_cost: 1\.0 is not accepted; write a string"):
         with_cost(steps(), 1.0)

@@ -201,6 +201,23 @@ def test_the_whole_chain_with_an_integrator():
     assert lm.solve(problem).verified
 
 
+def test_a_stage_cost():
+    own = made(steps()).replaced(
+        stage_cost=ca.Function("L", [x, u], [1 + x**2 + u / 3], ["x", "u"], ["l"])
+    )
+    assert own.stage_cost == "1 + x**2 + u/3"
+    plain = made(steps(cost="1 + x**2 + u/3"))
+    assert lm.compile(own).digest == lm.compile(plain).digest
+    for wrong, words in (
+        (ca.Function("L", [x], [ca.vertcat(x, x)], ["x"], ["l"]), "one number as its output"),
+        (ca.Function("L", [double("s", 2)], [1], ["s"], ["l"]), "one number|2 elements"),
+        (ca.Function("L", [x], [ca.erf(x)], ["x"], ["l"]), "no place for erf"),
+        (x**2, "no casadi.Function"),
+    ):
+        with pytest.raises(lm.BadInput, match=rf"stage_cost.*({words})"):
+            made(steps()).replaced(stage_cost=wrong)
+
+
 # What is refused ---------------------------------------------------------------------------------
 
 

@@ -1,4 +1,4 @@
-"""The stage cost: a formula; in Python also a function, or a SymPy expression."""
+"""The stage cost: a formula; in Python also a function, or an expression of another tool."""
 
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -12,7 +12,9 @@ from lmdsl.systems.black_box.function_map import FunctionMap, parameters_of
 from lmdsl.systems.black_box.returned import Returned
 from lmdsl.systems.black_box.scalar_map import ScalarMap
 from lmdsl.systems.function import FunctionSystem
-from lmdsl.systems.translated.sympy_systems import is_sympy, text
+from lmdsl.systems.translated import casadi_systems, sympy_systems
+from lmdsl.systems.translated.casadi_systems import is_casadi
+from lmdsl.systems.translated.sympy_systems import is_sympy
 from lmdsl.systems.translated.terms import Untranslatable
 
 # What a result directory says in place of a function.
@@ -20,9 +22,10 @@ FUNCTION: Final = {"kind": "function"}
 
 
 def _read(value: Any, formula: Callable[[Any], Any]) -> Any:
-    if is_sympy(value):  # some of these can be called, for other reasons
+    tool = sympy_systems if is_sympy(value) else casadi_systems if is_casadi(value) else None
+    if tool is not None:  # whose expressions can be called, too, but not with arrays by name
         try:
-            return formula(text(value))
+            return formula(tool.text(value))
         except Untranslatable as why:
             raise BadInput(
                 f"formulas have no place for {why}; write the cost as a Python function"

@@ -112,6 +112,30 @@ def from_casadi(
     return systems.of_formulas(formulas, constants, time)
 
 
+def is_casadi(value: Any) -> bool:
+    """Return whether a value is CasADi's, without importing it."""
+    return any(
+        (each.__module__ or "").partition(".")[0] == "casadi" for each in type(value).__mro__
+    )
+
+
+def text(function: Any) -> str:
+    """Return the formula of a CasADi function of scalars, named as they are, to one scalar.
+
+    Raises
+    ------
+    Untranslatable
+        The language has no word for a part of it; the message names it.
+    BadInput
+        It is another kind of function.
+    """
+    casadi = systems.needed("casadi")
+    if not isinstance(function, casadi.Function) or function.nnz_out() != 1:
+        raise BadInput(f"{shown(function)} is no casadi.Function with one number as its output")
+    (formula,) = _texts(casadi, function, _arguments(function, None), [0])
+    return formula
+
+
 def _arguments(function: Any, arguments: Any) -> list[tuple[str, ...]]:
     """Return the names of the elements of every input."""
     inputs = [function.name_in(k) for k in range(function.n_in())]
