@@ -4,7 +4,7 @@ With u the policy, P_u, G_u its rows, g = max(gamma, 1), five claims, each an in
 stored doubles that holds in exact arithmetic (see bounds.py):
 
 1. stabilizing   w > 0, w >= g P_u w + d with d > 0. Then rho(g P_u) <= 1 - min d/w < 1: from every
-                 cell of C the chain reaches A almost surely, with geometric decay.
+                 cell of C the chain reaches A (or, discounted, ends) almost surely, geometrically.
 2. upper bound   V_up >= gamma P_u V_up + G_u, V_up >= 0: the policy costs at most m'V_up.
 3. lower bound   W <= gamma P_a W + G_a for every surviving pair: no policy that stays in C u A and
                  has finite weighted occupation costs less than m'W.

@@ -53,22 +53,28 @@ def integers(x: list[Fraction]) -> tuple[list[int], int]:
 def residual(lp: StabilizationLP, rows: Iterable[Row], mu: list[Fraction]) -> Fraction:
     """Return ||m - mu + gamma P_u'mu||_1 for the rows of a policy."""
     a, shift = integers(mu)
-    inflow: list[dict[int, int]] = [{} for _ in range(lp.n)]  # by denominator
-    for i, (row, total) in enumerate(rows):
-        for j, s in row:
-            inflow[j][total] = inflow[j].get(total, 0) + a[i] * s
-    left = _left(lp, inflow, mu, Fraction(lp.gamma) / 2**shift)
+    arrivals = _arrivals(lp, rows, a)
+    rate, weight = Fraction(lp.gamma) / 2**shift, lp.weight.tolist()
+    left = (abs(Fraction(weight[j]) - mu[j] + rate * x) for j, x in enumerate(arrivals))
     if lp.rows.shares.total is not None:
         return sum(left, Fraction(0))
     return Fraction(sum(-(-x.numerator * 2**FINE // x.denominator) for x in left), 2**FINE)
 
 
-def _left(
-    lp: StabilizationLP, inflow: list[dict[int, int]], mu: list[Fraction], rate: Fraction
-) -> Iterator[Fraction]:
-    for j, m in enumerate(lp.weight.tolist()):
-        arrives = sum((Fraction(x, total) for total, x in inflow[j].items()), Fraction(0))
-        yield abs(Fraction(m) - mu[j] + rate * arrives)
+def _arrivals(lp: StabilizationLP, rows: Iterable[Row], a: list[int]) -> Iterator[Fraction]:
+    """Return what arrives in each cell, P_u'a."""
+    total = lp.rows.shares.total
+    if total is not None:
+        inflow = [0] * lp.n
+        for i, (row, _) in enumerate(rows):
+            for j, s in row:
+                inflow[j] += a[i] * s
+        return (Fraction(x, total) for x in inflow)
+    by_total: list[dict[int, int]] = [{} for _ in range(lp.n)]
+    for i, (row, own) in enumerate(rows):
+        for j, s in row:
+            by_total[j][own] = by_total[j].get(own, 0) + a[i] * s
+    return (sum((Fraction(x, t) for t, x in part.items()), Fraction(0)) for part in by_total)
 
 
 def fractions(x: Floats) -> list[Fraction]:

@@ -137,6 +137,9 @@ def test_frozen_lake(name, tmp_path):
     np.testing.assert_allclose(chosen, V, atol=1e-9)
     runs = result.simulate(4000, 10_000, seed=1)
     assert runs.lost == 0
+    away = abs(runs.cost["mean"] - result.cost)  # every run pays for what it misses after its end
+    assert runs.reached == 4000
+    assert away <= 4 * runs.cost["standard_error"]
     # Where all but the goal's own reward is 0, the reward is the discounted chance to get there.
     assert 0 <= result.reward <= 1
 
