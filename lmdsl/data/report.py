@@ -10,6 +10,7 @@ from lmdsl.common.records import Reported
 from lmdsl.common.types import Guard, Policy
 from lmdsl.data.intervals import Family, intervals, observed, unseen
 from lmdsl.data.worst_case import Bounds, bounds
+from lmdsl.machine.deadline import TimeLimitReached
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.systems import DataSystem
@@ -130,7 +131,10 @@ def policy_bounds(
     """Return proved bounds of a policy's cost over all chains that the data allow at a level."""
     b = 1.0 if lp.problem.discount is None else lp.problem.discount
     rows = intervals(observed(lp, policy), Family.of(lp), level)
-    return bounds(rows, lp.cost[policy], lp.gamma * b, lp.growth * b, guard)
+    try:
+        return bounds(rows, lp.cost[policy], lp.gamma * b, lp.growth * b, guard)
+    except TimeLimitReached:
+        return Bounds(np.zeros(lp.n), np.full(lp.n, np.inf))
 
 
 def _range(lp: StabilizationLP, found: Bounds) -> Range:

@@ -113,6 +113,7 @@ def _threshold(rows: IntervalRows, V: Floats, sign: float) -> Floats:
 
 
 def _solved(rows: IntervalRows, p: Floats, G: Floats, factor: float) -> Floats | None:
+    """Return the value of a chain; None where it is not finite and >= 0."""
     from scipy.sparse import csc_array, csr_array, eye_array
     from scipy.sparse.linalg import splu
 
@@ -120,7 +121,7 @@ def _solved(rows: IntervalRows, p: Floats, G: Floats, factor: float) -> Floats |
     whole: Any = csr_array((p, rows.target, rows.pointer), shape=(n, n + 1))
     try:
         V = splu(csc_array(eye_array(n) - factor * whole[:, :n])).solve(G)
-    except RuntimeError:  # singular
+    except (RuntimeError, MemoryError):  # singular, or its factors are too large
         return None
     least = -1e-9 * float(np.abs(V).max(initial=0.0))
     return V if np.isfinite(V).all() and V.min(initial=0.0) >= least else None

@@ -1,6 +1,8 @@
 """What is known while a problem is solved, and the result made of it."""
 
+import time
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -152,6 +154,16 @@ class _Job:
         except TimeLimitReached:
             return None
 
+    def _data(self, witness: Witness) -> DataReport | None:
+        """Report on recorded data, as far as there is time."""
+        if not isinstance(self.lp.problem.system, DataSystem):
+            return None
+        started = time.perf_counter()
+        guard = partial(self.finish.raise_if_over, "bounding the true cost")
+        report = DataReport.of(self.lp, witness.policy, guard)
+        self.verify_seconds = (self.verify_seconds or 0.0) + time.perf_counter() - started
+        return report
+
     def _result(
         self, witness: Witness, proof: Certificate, status: Status, message: str, **more: Any
     ) -> Result:
@@ -163,8 +175,7 @@ class _Job:
         solved = status != Status.NOT_STABILIZABLE
         attractor = lp.cell_status == CellStatus.ATTRACTOR
         local = LocalController.of(lp.problem, lp.partition, attractor)
-        from_data = isinstance(lp.problem.system, DataSystem)
-        data = DataReport.of(lp, witness.policy) if from_data else None
+        data = self._data(witness)
         error = self._integration_error()
         said = [data.sentence() if data else "", error.warning() if error else ""]
         return Result(

@@ -87,8 +87,19 @@ def _data(lp: StabilizationLP, result: Result) -> list[str]:
     return [
         _differs(f"data.{field.name}", ours, theirs)
         for field in fields(DataReport)
-        if not _alike(ours := getattr(stored, field.name), theirs := getattr(found, field.name))
+        if not (_wider if field.name == "cost" else _alike)(
+            ours := getattr(stored, field.name), theirs := getattr(found, field.name)
+        )
     ]
+
+
+def _wider(stored: Any, found: Any) -> bool:
+    """Return whether a stored range says no more than the one found."""
+    if stored is None or found is None:
+        return stored is found
+    (low, high), (least, most) = stored, found
+    lower = low is not None and low <= least * (1 + 1e-9)
+    return lower and (high is None or (most is not None and high >= most * (1 - 1e-9)))
 
 
 def _alike(a: Any, b: Any) -> bool:
