@@ -93,7 +93,9 @@ def check(lines):
     cells = [json.loads(next(lines)) for _ in range(n)]
     pairs = read_pairs(lines, n, K, total, n + 1 + ("discount" in head))
     refusal = head["kind"] == "refusal"
-    return (check_refusal if refusal else check_policy)(head, cells, pairs, Fraction(gamma))
+    judge = check_refusal if refusal else check_policy
+    verdict, numbers = judge(head, cells, pairs, Fraction(gamma))
+    return verdict, [*numbers, *(f"assumed: {head[key]!a}" for key in head if key == "assumes")]
 
 
 def vector(cells, name, verdict, claim, positive=False):

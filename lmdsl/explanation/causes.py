@@ -42,7 +42,7 @@ def _meanings(problem: Problem) -> dict[str, str]:
     """Return what each cause means, by its name."""
     meaning = dict(MEANING)
     if isinstance(problem.system, MatrixSystem):
-        meaning[CellStatus.ESCAPES] = "every action may escape or enter avoid, or there is none"
+        meaning[CellStatus.ESCAPES] = finite.escaping(problem)
     elif problem.admissible is not None:
         meaning[CellStatus.ESCAPES] += ", or is not admissible at one"
     if problem.ends_in_time:

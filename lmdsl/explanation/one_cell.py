@@ -36,7 +36,7 @@ class Move(Frozen):
         ``leaves`` the box, enters ``avoid``, is ``not finite``, is ``not admissible`` (the
         condition of the problem does not hold), or ``enters`` a cell that is not stabilizable; in a
         finite model also ``missing``, the control is not available, and ``escapes``, the row sums
-        to less than 1.
+        to less than 1; of recorded data ``not recorded``, and ``seen to leave`` the box.
     state, noise, image
         The first sample that does so, and where it lands, or is judged on the way; noise is empty
         without noise.
@@ -72,6 +72,11 @@ class Move(Frozen):
         start = f"{control} loses" if control else "it loses"
         if self.kind == "missing":
             return f"{control} is not available"
+        if self.kind == "not recorded":
+            return f"{control or 'what it does'} was not recorded here, or not often enough"
+        if self.kind == "seen to leave":
+            share = f"{100 * self.share:.3g} % of the recorded transitions"
+            return f"{control or 'it'} was seen to leave the box in {share}"
         if self.kind == "escapes":
             return f"{start} {100 * self.share:.3g} %: its row sums to so much less than 1"
         sample = (

@@ -93,6 +93,8 @@ def _head(result: Result, lp: StabilizationLP, refused: bool) -> dict[str, Any]:
     }
     if result.problem.discount is not None:
         head["discount"] = result.problem.discount.hex()
+    if lp.problem.system.assumes:
+        head["assumes"] = lp.problem.system.assumes
     if not refused:
         for name in ("tolerance", "cost", "lower_bound", "contraction"):
             value = getattr(result, name)

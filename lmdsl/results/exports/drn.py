@@ -67,7 +67,7 @@ def _lines(lp: StabilizationLP) -> Iterator[bytes]:
     where = "".join(f"; state {j}: the {name}" for j, name in last.items())
     yield (
         "// written by lmdsl\n"
-        f"// model {lp.digest}\n"
+        f"// model {lp.digest}\n{_assumed(lp)}"
         f"// states 0 to {lp.n - 1}: the stabilizable cells{where}\n"
         "@type: MDP\n@parameters\n\n@reward_models\ncost\n"
         f"@nr_states\n{lp.n + len(last)}\n@nr_choices\n{lp.K + len(last)}\n@model\n"
@@ -80,6 +80,11 @@ def _lines(lp: StabilizationLP) -> Iterator[bytes]:
         yield "".join(text).encode()
     for j, name in last.items():
         yield f"state {j} [0] {name}\n\taction stay [0]\n\t\t{j} : 1\n".encode()
+
+
+def _assumed(lp: StabilizationLP) -> str:
+    assumes = lp.problem.system.assumes
+    return f"// assumed: {assumes}\n" if assumes else ""
 
 
 def _row(lp: StabilizationLP, k: int) -> list[tuple[int, Fraction]]:
