@@ -22,7 +22,7 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.local_control import ConstantControl
 from lmdsl.problem.problem import Problem
-from lmdsl.systems import MatrixSystem
+from lmdsl.systems import DataSystem, MatrixSystem
 from lmdsl.systems.matrices.system import Draws
 
 REACHED, LOST, CYCLING = 0, 1, 2
@@ -98,7 +98,8 @@ class ClosedLoop:
         self.draws = Draws(system.rows) if isinstance(system, MatrixSystem) else None
         self.noise = Drawn(problem, as_compiled)
         self.weight = problem.gamma * (problem.discount or 1.0)
-        self._stage, terminal = problem.stage(), problem.terminal()
+        paid = isinstance(system, MatrixSystem) and system.pays_all
+        self._stage, terminal = None if paid else problem.stage(), problem.terminal()
         self._terminal: Program | None = None
         if terminal is not None:
             self._terminal = Program([terminal], problem.system.constants())
@@ -120,7 +121,16 @@ class ClosedLoop:
     @property
     def method(self) -> str:
         """What is followed, in words."""
+        if self.draws is not None:
+            return self.followed
         return "as compiled: " * self.as_compiled + self.steps.method
+
+    @property
+    def followed(self) -> str:
+        """Whose runs these are: of data nothing but the recorded rows is known."""
+        if self.draws is None:
+            return "true map"
+        return "recorded rows" if isinstance(self.problem.system, DataSystem) else "given rows"
 
     def step(
         self, x: Floats, cell: Indices, rng: np.random.Generator, deadline: Deadline = FOREVER

@@ -13,6 +13,7 @@ from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 
+UNSAID = ("aimed", "followed")  # fields that no report holds apart
 FEW = 0.01  # share of runs that miss the attractor above which the samples are called too few
 
 
@@ -46,6 +47,8 @@ class Simulation(Frozen):
         None where none reached. To be compared with the certificate's cost where all reach.
     method
         What was followed, in words: the map, or how its equation was integrated.
+    followed
+        Whose runs they are: the true map's, or those of a finite model's rows.
     """
 
     starts: int
@@ -61,18 +64,19 @@ class Simulation(Frozen):
     lost_to: dict[str, int] = field(default_factory=lambda: dict.fromkeys(LOSSES, 0))
     cost: dict[str, float | None] | None = None
     method: str = ""
+    followed: str = "true map"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        return {key: jsonable(value) for key, value in asdict(self).items() if key != "aimed"}
+        return {key: jsonable(value) for key, value in asdict(self).items() if key not in UNSAID}
 
     def sentence(self) -> str:
         """Return what became of the runs, and what it means where many did not arrive."""
         if not self.aimed:
             few = ": too few samples, or too large cells" * (self.lost > FEW * self.starts)
             steps, lost = f"{self.steps_made:,} steps", f"{self.lost:,} of {self.starts:,}"
-            return f"true map: discounted, no target; {lost} runs are lost in {steps}{few}"
-        parts = [f"true map: {self.reached:,} of {self.starts:,} runs arrive"]
+            return f"{self.followed}: discounted, no target; {lost} runs are lost in {steps}{few}"
+        parts = [f"{self.followed}: {self.reached:,} of {self.starts:,} runs arrive"]
         parts += [f"{self.lost:,} {'is' if self.lost == 1 else 'are'} lost"] * bool(self.lost)
         parts += [f"{self.cycling:,} cycle{'s'[self.cycling != 1 :]}"] * bool(self.cycling)
         text = ", ".join(parts)
@@ -87,7 +91,7 @@ class Simulation(Frozen):
         """Return a summary for people."""
         low, high = self.interval
         lines = [
-            f"{self.starts} runs of the true map from random starts",
+            f"{self.starts} runs of the {self.followed} from random starts",
             f"  reached the attractor  {self.reached}  ({100 * self.reached / self.starts:.4g} %; "
             f"95 % interval {100 * low:.4g} to {100 * high:.4g} %)",
             f"  lost                   {self.lost}{self._causes()}",
@@ -95,7 +99,7 @@ class Simulation(Frozen):
         ]
         if not self.aimed:
             lines[1:4] = [lines[2], f"  going on               {self.cycling}  (no target)"]
-        if self.method != AS_DECLARED:
+        if self.method not in (AS_DECLARED, self.followed):
             lines.insert(1, f"  followed               {self.method}")
         if self.cut:
             lines[-1] += f"  (or cut off by the time limit after {self.steps_made} steps)"
@@ -192,6 +196,7 @@ def simulate(
         },
         cost=_mean(runs.cost[outcome == REACHED]),
         method=loop.method,
+        followed=loop.followed,
     )
 
 

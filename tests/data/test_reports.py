@@ -56,6 +56,7 @@ def test_the_command_line_names_what_is_assumed(tmp_path, capsys):
     assert main(["verify", str(tmp_path / "out")]) == 0
     assert "assumed: no transition occurs that was not recorded" in capsys.readouterr().out
     assert main(["simulate", str(tmp_path / "out"), "--starts", "50"]) == 0
+    assert "50 runs of the recorded rows from random starts" in capsys.readouterr().out
     from lmdsl.cli.solving import _summary
 
     text = _summary(result)
@@ -119,3 +120,12 @@ def test_definitions_and_conditions_of_a_problem_file():
     both = problem(let={"far": "where(x > 1, 2, 1)"}, stage_cost="far", admissible="u < 1")
     result = lm.solve(both)
     assert result.value[[1, 2]] == pytest.approx([4 / 3, 2 + 4 / 3])
+
+
+def test_simulated_runs_pay_what_was_recorded():
+    """The stage cost once: the mean over the recorded states is what a run pays."""
+    result = lm.solve(problem(stage_cost="1 + x"))
+    runs = result.simulate(4000, 1000)
+    assert runs.reached == 4000
+    assert abs(runs.cost["mean"] - result.cost) < 5 * runs.cost["standard_error"]
+    assert runs.method == "recorded rows"
