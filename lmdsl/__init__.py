@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from lmdsl import plotting as plotting
     from lmdsl import systems as systems
     from lmdsl import testing as testing
+    from lmdsl.advice.checking import check as check
+    from lmdsl.advice.report import CheckReport as CheckReport
+    from lmdsl.advice.report import Finding as Finding
     from lmdsl.certificate.claims import Certificate as Certificate
     from lmdsl.control.controller import Controller as Controller
     from lmdsl.control.simulation import Simulation as Simulation
@@ -51,9 +54,11 @@ _HOME = {
     "BadInput": "errors",
     "CellStatus": "model.stabilizable_set",
     "Certificate": "certificate.claims",
+    "CheckReport": "advice.report",
     "Comparison": "results.comparison",
     "Controller": "control.controller",
     "Explanation": "explanation.causes",
+    "Finding": "advice.report",
     "GammaBar": "optimize.feasibility.gamma_bar",
     "LmdslError": "errors",
     "PhaseOne": "explanation.lost_mass",
@@ -64,6 +69,7 @@ _HOME = {
     "StabilizationLP": "model.lp",
     "TimeLimitReached": "machine.deadline",
     "Verification": "results.verification",
+    "check": "advice.checking",
     "compare": "results.comparison",
     "compile": "model.lp",
     "explain": "explanation.causes",

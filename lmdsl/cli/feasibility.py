@@ -1,4 +1,4 @@
-"""``gamma-max`` and ``explain``: what can be stabilized, and why the rest cannot."""
+"""``check``, ``gamma-max``, ``explain``: what looks wrong, what can be stabilized, why not all."""
 
 from lmdsl.cli.output import Arguments, Command, ProgressLine, answer, print_json, shared
 from lmdsl.cli.streams import say
@@ -6,6 +6,9 @@ from lmdsl.cli.streams import say
 
 def add(command: Command) -> None:
     """Add the commands of this module."""
+    check = command("check", _check, "Say what looks wrong with a problem before the long run.")
+    shared(check, "file", "--time-limit", "--json")
+
     limit = command("gamma-max", _gamma_max, "Enclose the largest feasible gamma.")
     shared(limit, "file", "--time-limit")
     limit.add_argument("--width", type=float, default=1e-6, metavar="W",
@@ -18,6 +21,17 @@ def add(command: Command) -> None:
     explain.add_argument("--phase-one", action="store_true",
                          help="phase-one LP: how much mass cannot be stabilized")  # fmt: skip
     shared(explain, "--time-limit", "--json")
+
+
+def _check(parsed: Arguments) -> int:
+    from lmdsl.advice.checking import check
+    from lmdsl.problem.problem import load
+
+    problem = load(parsed.file)
+    with ProgressLine() as progress:
+        found = check(problem, time_limit=parsed.time_limit, progress=progress)
+    answer(parsed, found)
+    return int(bool(found))
 
 
 def _gamma_max(parsed: Arguments) -> int:

@@ -13,9 +13,13 @@ def add(command: Command) -> None:
     """Add the commands of this module."""
     command("schema", _schema, "Print the JSON Schema of the problem file.")
     shared(command("systems", _systems, "List the systems known by name."), "--json")
-    init = command("init", _init, "Write the default problem of a named system.")
-    init.add_argument("name", metavar="NAME", help="a system (see `lmdsl systems`)")
-    init.add_argument("--out", metavar="FILE", help="file to write (default NAME.json)")
+    init = command("init", _init, "Write a script for a system of your own, or the problem file of "
+                   "one known by name.")  # fmt: skip
+    init.add_argument("name", metavar="NAME", nargs="?", help="a system (see `lmdsl systems`)")
+    init.add_argument("--json", dest="bare", action="store_true",
+                      help="without NAME: the problem file instead of the script")  # fmt: skip
+    init.add_argument("--out", metavar="FILE",
+                      help="file to write (default NAME.json; own_system.py or .json)")  # fmt: skip
     shared(command("backends", _backends, "List the backends."), "--json")
 
 
@@ -45,20 +49,37 @@ def _systems(parsed: Arguments) -> int:
 
 def _init(parsed: Arguments) -> int:
     from lmdsl.common.files import write_whole
+
+    name, script = parsed.name or "own_system", parsed.name is None and not parsed.bare
+    text = _script() if script else _problem_file(parsed.name)
+    path = Path(parsed.out if parsed.out is not None else f"{name}{'.py' if script else '.json'}")
+    if path.exists():
+        raise BadInput(f"{shown(str(path), 200)} exists; remove it or choose another name", "out")
+    write_whole(path, text.encode())
+    file = printable(str(path))
+    then = f"python {file}" if script else f"lmdsl solve {file} --out out"
+    say(f"written to {file}; next: {then}")
+    return 0
+
+
+def _script() -> str:
+    from lmdsl.cli.own_system import SCRIPT
+
+    return SCRIPT
+
+
+def _problem_file(name: str | None) -> str:
+    """Return the problem file of a system known by name, or of one's own to start from."""
+    from lmdsl.cli.own_system import declared
     from lmdsl.problem.problem import Problem
     from lmdsl.systems import NAMED
 
-    if parsed.name not in NAMED:
-        near = spelling.hint(parsed.name, NAMED) or ";"
+    if name is not None and name not in NAMED:
+        near = spelling.hint(name, NAMED) or ";"
         known = ", ".join(NAMED)
-        raise BadInput(f"{shown(parsed.name)} is not a system{near} known: {known}", "NAME")
-    path = Path(parsed.out if parsed.out is not None else f"{parsed.name}.json")
-    if path.exists():
-        raise BadInput(f"{shown(str(path), 200)} exists; remove it or choose another name", "out")
-    problem: Problem = Problem.model_validate(NAMED[parsed.name].problem)
-    write_whole(path, problem.to_json().encode())
-    say(f"written to {printable(str(path))}; next: lmdsl solve {printable(str(path))} --out out")
-    return 0
+        raise BadInput(f"{shown(name)} is not a system{near} known: {known}", "NAME")
+    problem: Problem = Problem.model_validate(NAMED[name].problem if name else declared())
+    return problem.to_json()
 
 
 def _backends(parsed: Arguments) -> int:

@@ -1,7 +1,6 @@
 """Infeasibility explained: by cause and region, cell by cell, in mass, and what would help."""
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,14 +11,16 @@ from lmdsl.common.records import Frozen
 from lmdsl.common.types import Progress, Statuses
 from lmdsl.errors import BadInput, shown
 from lmdsl.explanation import finite, one_cell
-from lmdsl.explanation.hints import Hint, hints
+from lmdsl.explanation.changes import every_hint
+from lmdsl.explanation.hints import Hint
 from lmdsl.explanation.lost_mass import PhaseOne
 from lmdsl.explanation.one_cell import NAMES, Why
-from lmdsl.machine.deadline import Deadline, TimeLimitReached
+from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model import stabilizable_set
 from lmdsl.model.assembly.sampler import Sampler
+from lmdsl.model.assembly.substeps import settled
 from lmdsl.model.assembly.transitions import Transitions, assemble
 from lmdsl.model.discretization import control_count
 from lmdsl.model.grid import boxes
@@ -265,6 +266,7 @@ def explain(
         status.setflags(write=False)
         problem = problem.problem
     else:
+        problem = settled(problem, deadline)
         partition = Partition.of(problem)
         assembled = assemble(problem, partition, progress, deadline)
         status = _status(problem, assembled, deadline)
@@ -280,10 +282,7 @@ def explain(
     solved = None
     if phase_one and assembled is not None:
         solved = PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
-    helpful: tuple[Hint, ...] = ()
-    with suppress(TimeLimitReached):
-        if not isinstance(problem.system, MatrixSystem):  # there is no map to try it with
-            helpful = hints(Sampler(problem, partition, deadline, "trying what helps"), status)
+    helpful = every_hint(problem, partition, status, deadline)
     return Explanation(problem, partition, status, tuple(found), helpful, solved, assembled)
 
 
@@ -304,7 +303,9 @@ def phase_one(problem: Problem, time_limit: float | Deadline | None = None) -> P
     LmdslError
         The LP is not solved.
     """
-    partition, deadline = Partition.of(problem), Deadline.of(time_limit)
+    deadline = Deadline.of(time_limit)
+    problem = settled(problem, deadline)
+    partition = Partition.of(problem)
     assembled = assemble(problem, partition, deadline=deadline)
     status = _status(problem, assembled, deadline)
     return PhaseOne.of(partition, assembled, status, problem.gamma, deadline)

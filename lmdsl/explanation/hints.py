@@ -23,20 +23,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common.records import Reported
 from lmdsl.common.types import Bools, Floats, Indices, Statuses
-from lmdsl.model.assembly.sampler import CHUNK, Sampler
+from lmdsl.explanation.trials import MOST_CONTROLS, MapTrial, some
+from lmdsl.machine.deadline import Deadline
 from lmdsl.model.discretization import control_values
 from lmdsl.model.grid.axis import EDGE
+from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import LOST, CellStatus
+from lmdsl.problem.problem import Problem
 
 # Steps of a run; share of the axis above which a side is left too far; share of cells below which a
 # hint has no support; share of them for which its numbers suffice.
 STEPS, NEAR, SUPPORT, QUANTILE = 64, 0.25, 0.05, 0.9
-# Numbers above which only so many of them are tried, evenly chosen.
-MOST_CELLS, MOST_CONTROLS, MOST_POINTS, MOST_NODES = 512, 64, 16, 4
 # How far beyond the end of a control's range is tried, in lengths of the range.
 BEYOND = (0.0, 0.125, 0.25, 0.5, 1.0)
 
@@ -48,7 +48,8 @@ class Hint(Reported):
     Attributes
     ----------
     kind
-        ``larger box``, ``more controls`` or ``finer grid``.
+        ``larger box``, ``more controls`` or ``finer grid``; of changes that were compiled
+        (:mod:`lmdsl.explanation.changes`) ``longer step``, ``periodic axis`` or ``box attractor``.
     text
         One sentence.
     numbers
@@ -60,58 +61,39 @@ class Hint(Reported):
     numbers: dict[str, Any]
 
 
-def hints(sampler: Sampler, status: Statuses) -> tuple[Hint, ...]:
+def hints(
+    problem: Problem,
+    partition: Partition,
+    status: Statuses,
+    deadline: Deadline | None = None,
+) -> tuple[Hint, ...]:
     """Return the hints that trials support, given the status of all cells (N,)."""
     lost = np.isin(status, LOST)
     if not lost.any():
         return ()
-    trial = _Trial(sampler, status)
+    trial = _Trial(problem, partition, deadline, "trying what helps")
+    trial.status = status
     escaping = np.flatnonzero(status == CellStatus.ESCAPES)
     with np.errstate(all="ignore"):
-        found = _by_runs(trial, _some(np.flatnonzero(lost), trial.most_cells))
+        found = _by_runs(trial, some(np.flatnonzero(lost), trial.most_cells))
         if len(escaping):
-            found += _more_controls(trial, _some(escaping, min(trial.most_cells, 64)))
+            found += _more_controls(trial, some(escaping, min(trial.most_cells, 64)))
     return tuple(found)
 
 
-def _some(values: NDArray[Any], most: int) -> NDArray[Any]:
-    """Return at most so many values, evenly chosen, with both ends."""
-    if len(values) <= most:
-        return values
-    chosen: NDArray[Any] = values[np.linspace(0, len(values) - 1, most).round().astype(int)]
-    return chosen
+class _Trial(MapTrial):
+    """The true map, and what becomes of its images."""
 
-
-class _Trial:
-    """The true map on arrays of shape (cells, controls, points, nodes)."""
-
-    def __init__(self, sampler: Sampler, status: Statuses) -> None:
-        self.sampler, self.status, self.partition = sampler, status, sampler.partition
-        self.points = _some(sampler.points, MOST_POINTS)
-        self.nodes = _some(sampler.nodes.values, MOST_NODES)
-        self.noise = list(np.ascontiguousarray(self.nodes.T)[:, None, None, None, :])
-        self.controls = _some(sampler.controls, MOST_CONTROLS)
-        each = len(self.points) * len(self.nodes) * len(self.controls)
-        self.most_cells = max(1, min(MOST_CELLS, CHUNK // each))
-        low, high = self.partition.low, self.partition.high
-        self.span = high - low
-
-    def start(self, cells: Indices) -> list[Floats]:
-        """Return the states of sample points, per axis (cells, 1, points, 1)."""
-        return [x[:, None, :, None] for x in self.partition.samples(cells, self.points)]
-
-    def vectors(self) -> list[Floats]:
-        """Return the controls tried, per variable (1, controls, 1, 1)."""
-        return [np.ascontiguousarray(u)[None, :, None, None] for u in self.controls.T]
+    status: Statuses  # of all cells
 
     def step(
         self, state: list[Floats], controls: list[Floats], shape: tuple[int, ...]
     ) -> tuple[list[Floats], Floats, Indices]:
         """Return images per axis, overshoot (2 d, *shape) by side, and status (-1 outside)."""
         p = self.partition
-        named = self.sampler.true_map.named(state, controls, self.noise)
         images, over = [], np.zeros((2 * p.dimension, *shape))
-        for k, (axis, image) in enumerate(zip(p.axes, self.sampler.step(named), strict=True)):
+        found = self.images(state, controls)
+        for k, (axis, image) in enumerate(zip(p.axes, found, strict=True)):
             x = axis.state(np.broadcast_to(image, shape), p.clip)
             if not (axis.periodic or p.clip):
                 low, high = float(p.low[k]), float(p.high[k])
@@ -122,7 +104,7 @@ class _Trial:
         flat = p.locate(images)
         finite = np.logical_and.reduce([np.isfinite(x) for x in images])
         code = np.where(flat >= 0, self.status[flat].astype(np.int64), -1)
-        admitted = self.sampler.admits(named)
+        admitted = self.admits(state, controls)
         fine = finite if admitted is None else finite & admitted
         return images, over, np.where(fine, code, np.int64(CellStatus.AVOID))
 
@@ -135,7 +117,7 @@ class _Trial:
 
 
 def _by_runs(trial: _Trial, cells: Indices) -> list[Hint]:
-    shape = (len(cells), len(trial.controls), len(trial.points), len(trial.nodes))
+    shape = trial.shape(cells)
     held = trial.vectors()
     state: list[Floats] = [np.broadcast_to(x, shape) for x in trial.start(cells)]
     arrived, live = np.zeros(shape, dtype=np.bool_), np.ones(shape, dtype=np.bool_)
@@ -226,8 +208,8 @@ def _worst(trial: _Trial, cells: Indices, controls: list[Floats]) -> Floats:
 def _more_controls(trial: _Trial, cells: Indices) -> list[Hint]:
     vectors = trial.controls[_worst(trial, cells, trial.vectors()).argmin(axis=1)]
     found = []
-    for k, values in enumerate(control_values(trial.sampler.problem)):
-        grid = _some(np.sort(values), MOST_CONTROLS)
+    for k, values in enumerate(control_values(trial.problem)):
+        grid = some(np.sort(values), MOST_CONTROLS)
         if len(grid) < 3:
             continue
         length = float(grid[-1] - grid[0])
@@ -245,7 +227,7 @@ def _more_controls(trial: _Trial, cells: Indices) -> list[Hint]:
             needed = np.array(BEYOND[1:])[admissible[good].argmax(axis=1)]
             far = float(np.quantile(needed, QUANTILE, method="higher"))
             to = float(towards[-1]) + sign * far * length
-            name = trial.sampler.problem.controls[k]
+            name = trial.problem.controls[k]
             left = float(np.median(worst[good, -1]))
             text = (
                 f"more controls: in {count} of {tried} escaping cells tried the overshoot falls "

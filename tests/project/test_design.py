@@ -20,19 +20,20 @@ PACKAGE = Path(lm.__file__).parent
 # Data flows one way: a package imports only from packages before it, inside functions too.
 PACKAGES = [
     "errors", "machine", "common", "formulas", "systems", "problem", "model", "certificate",
-    "optimize", "backends", "data", "control", "results", "explanation", "plotting", "testing",
-    "cli", "__main__",
+    "optimize", "backends", "data", "control", "results", "explanation", "advice", "plotting",
+    "testing", "cli", "__main__",
 ]  # fmt: skip
 
 # Imports against the order, inside functions: methods that only forward to a later package.
 FORWARDING = {("model.lp", "results.exports.mps")}
 
 PUBLIC = [
-    "Area", "BadInput", "CellStatus", "Certificate", "Comparison", "Controller", "Explanation",
-    "GammaBar", "LmdslError", "PhaseOne", "Problem", "Region", "Result", "Simulation",
-    "StabilizationLP", "TimeLimitReached", "Verification", "__version__", "backends",
-    "compare", "compile", "explain", "exports", "from_data", "from_matrices",
-    "gamma_max", "load", "plotting", "read_data", "solve", "systems", "testing", "verify",
+    "Area", "BadInput", "CellStatus", "Certificate", "CheckReport", "Comparison", "Controller",
+    "Explanation", "Finding", "GammaBar", "LmdslError", "PhaseOne", "Problem", "Region", "Result",
+    "Simulation", "StabilizationLP", "TimeLimitReached", "Verification", "__version__", "backends",
+    "check", "compare", "compile", "explain", "exports", "from_data",
+    "from_matrices", "gamma_max", "load", "plotting", "read_data", "solve", "systems",
+    "testing", "verify",
 ]  # fmt: skip
 
 

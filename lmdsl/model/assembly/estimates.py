@@ -96,8 +96,8 @@ ENCLOSED = 50  # operations on doubles that take as long as one on enclosures, s
 SET = 20_000  # additions that take as long as resolving a point or a box of a set, its cells apart
 
 
-def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
-    """Return a deadline, or one that never passes where compiling takes a moment at most."""
+def work(problem: Problem) -> float:
+    """Return the additions that take as long as compiling a problem; infinite for functions."""
     N = math.prod(axis.cells for axis in problem.state_box.values())
     lanes = N * discretization.control_count(problem)
     samples = discretization.sample_points(problem) * discretization.node_count(problem)
@@ -123,4 +123,9 @@ def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
         work += N * Program([density], problem.system.constants()).work
     if problem.local_controller is not None:  # linearised: some fifty operations for each
         work += 50 * CALL * step.effort
-    return Deadline() if work <= SHORT else deadline
+    return work
+
+
+def unless_short(problem: Problem, deadline: Deadline) -> Deadline:
+    """Return a deadline, or one that never passes where compiling takes a moment at most."""
+    return Deadline() if work(problem) <= SHORT else deadline

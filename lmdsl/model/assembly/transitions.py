@@ -97,7 +97,7 @@ def _assembled(
     # glibc returns the memory of a block to the system, to fault it in again for the next one,
     # unless it has seen more than that freed at once.
     np.empty(2**20)
-    assembler, parts = _Assembler(sampler, sets, shares), sampler.blocks(sets.free)
+    assembler, parts = Assembler(sampler, sets, shares), sampler.blocks(sets.free)
     for block, rows in sampler.asked.in_order(assembler, parts, deadline.cancel):
         pair_pointer[1 + block.first : 1 + block.first + len(block.cells)] += rows.per_cell
         pointer.append(rows.end + target.used)
@@ -132,7 +132,7 @@ def outcome(sampler: Sampler, cell: int, control: int) -> Indices:
     return np.where(index >= 0, index, -1.0).astype(np.int64)
 
 
-class _Assembler:
+class Assembler:
     """Computes the rows of blocks; it may be called from several threads at once."""
 
     def __init__(self, sampler: Sampler, sets: CellSets, shares: Shares) -> None:
@@ -146,6 +146,7 @@ class _Assembler:
         self.numbers = Numbering(sets.number, group, bits, first_code)
 
     def __call__(self, block: Block) -> tuple[Block, BlockRows]:
+        """Return a block and its rows; BadInput: a cost is negative or not finite."""
         sampler, lanes = self.sampler, block.lanes
         index, mean = sampler.outcomes(block)
         rows = BlockRows(

@@ -1,0 +1,1 @@
+"""What looks wrong with a problem, and what it takes, before the long run."""

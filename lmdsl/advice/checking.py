@@ -1,0 +1,76 @@
+"""``check``: what looks wrong with a problem, in plain words, before the long run."""
+
+from collections.abc import Iterator
+
+from lmdsl.advice import declaration, motion, sizes
+from lmdsl.advice.report import CheckReport, Finding
+from lmdsl.advice.survey import MOST_SETS, Survey
+from lmdsl.common import inputs
+from lmdsl.common.types import Progress
+from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.surroundings import own_arithmetic
+from lmdsl.model.assembly.substeps import settled
+from lmdsl.model.grid.partition import Partition
+from lmdsl.problem.problem import Problem
+from lmdsl.systems import MatrixSystem
+
+
+@own_arithmetic
+def check(
+    problem: Problem,
+    *,
+    time_limit: float | Deadline | None = None,
+    progress: Progress | None = None,
+) -> CheckReport:
+    """Say what looks wrong with a problem before the long run.
+
+    A survey of some cells is tried with the true map, and the problem compiled where that is cheap,
+    else on fewer cells: a matter of seconds, whatever the size.
+
+    Parameters
+    ----------
+    problem
+        A problem.
+    time_limit
+        Seconds.
+    progress
+        Called with (stage, -1).
+
+    Raises
+    ------
+    BadInput
+        The problem cannot be compiled.
+    TimeLimitReached
+        The time limit was reached.
+    """
+    inputs.kind(problem, Problem, "problem", "a Problem")
+    deadline = Deadline.of(time_limit)
+    if progress:
+        progress("check", -1.0)
+    own = {name: axis.cells for name, axis in problem.state_box.items()}
+    findings: list[Finding] = []
+    if isinstance(problem.system, MatrixSystem):
+        level, found = sizes.of_matrices(problem, deadline)
+        known = [level]
+    else:
+        partition = Partition.of(problem)
+        if partition.size <= MOST_SETS:
+            problem = settled(problem, deadline)
+        survey = Survey(problem, partition, deadline)
+        known = sizes.levels(problem, deadline)
+        found = sizes.expected(survey, known)
+        share = found.coverage if found.coverage_cells == own else None
+        findings += _of_the_map(survey, share, deadline)
+        findings += sizes.shrinking(problem, known, deadline)
+    findings += [*sizes.nothing(known, own), *sizes.too_large(found)]
+    return CheckReport(tuple(findings), found, own)
+
+
+def _of_the_map(survey: Survey, share: float | None, deadline: Deadline) -> Iterator[Finding]:
+    """Yield what is found about a map; the share that can be stabilized is None if unknown."""
+    yield from declaration.unused(survey.problem)
+    yield from declaration.angles(survey, share, deadline)
+    yield from declaration.degrees(survey)
+    yield from motion.on_edges(survey)
+    yield from motion.short_step(survey, share, deadline)
+    yield from motion.long_step(survey)

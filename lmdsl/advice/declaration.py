@@ -1,0 +1,134 @@
+"""Findings about what is declared: names that nothing uses, angles, and their units."""
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from lmdsl.advice.report import Finding
+from lmdsl.explanation import remedies
+from lmdsl.explanation.trials import MapTrial
+from lmdsl.machine.deadline import Deadline
+from lmdsl.problem.problem import Problem
+from lmdsl.systems.named import NamedSystem
+
+NAME = re.compile(r"[A-Za-z_]\w*")
+TURN = remedies.TURN
+SLACK = 1e-6  # part of a turn
+
+
+def unused(problem: Problem) -> Iterator[Finding]:
+    """Find parameters, controls, noise and subexpressions that no formula uses."""
+    if problem.functions:
+        return  # who knows what they use
+    formulas: list[str] = []
+    parameters: Any = problem.system.parameters
+    if isinstance(problem.system, NamedSystem):
+        formulas += problem.system.formulas.values()
+        parameters = ()  # its own formulas use them all
+    data = problem.to_dict()
+    formulas += _texts({key: data[key] for key in data if key not in ("format", "name")})
+    used = set(NAME.findall(" ".join(formulas)))
+    kinds = {
+        "system.parameters": parameters,
+        "let": data.get("let") or {},
+        "control_grid": problem.controls,
+        "noise": problem.noises,
+    }
+    for where, names in kinds.items():
+        for name in names:
+            if name not in used:
+                yield Finding(
+                    "unused",
+                    f"{where}.{name}",
+                    f"no formula uses {name}",
+                    "remove it, or correct the formula in which it was meant",
+                    {"name": name},
+                )
+
+
+def _texts(data: Any) -> list[str]:
+    """Return all strings in plain data."""
+    if isinstance(data, str):
+        return [data]
+    if isinstance(data, Mapping):
+        return [text for value in data.values() for text in _texts(value)]
+    if isinstance(data, list):
+        return [text for value in data for text in _texts(value)]
+    return []
+
+
+def angles(trial: MapTrial, share: float | None, deadline: Deadline) -> Iterator[Finding]:
+    """Find axes that look like circles and are not declared so.
+
+    ``share`` is that of the problem's cells that can be stabilized, None if it is not known.
+    """
+    for k, period in remedies.hidden_periods(trial):
+        name = trial.partition.names[k]
+        figures: dict[str, Any] = {
+            "axis": name, "period": period, "length": float(trial.span[k])
+        }  # fmt: skip
+        remedy = f"write {remedies.circle_words(trial.problem, name, period)}"
+        then = remedies.share_on_circle(trial.problem, name, period, deadline)
+        if share is not None and then is not None:
+            figures |= {"share": share, "share_then": then}
+            remedy += (
+                f": then {100 * then:.3g} % of the cells can be stabilized instead of "
+                f"{100 * share:.3g} %"
+            )
+        yield Finding(
+            "not_periodic",
+            f"state_box.{name}",
+            f"the map is the same when {name} is moved by {period:.7g}, and the axis is "
+            f"{trial.span[k]:.7g} long: {name} looks like an angle, and leaving the axis counts "
+            "as leaving the box",
+            remedy,
+            figures,
+        )
+
+
+def degrees(trial: MapTrial) -> Iterator[Finding]:
+    """Find coordinates of an attractor that are no radians though the map takes these."""
+    p = trial.partition
+    circles = {
+        name: (float(p.low[k]), float(p.high[k]))
+        for k, name in enumerate(p.names)
+        if abs(trial.span[k] - TURN) <= SLACK * TURN or remedies.repeats(trial, k, TURN)
+    }
+    for path, name, value in _coordinates(trial.problem):
+        low, high = circles.get(name, (-math.inf, math.inf))
+        if not low <= value <= high and abs(value) > TURN * (1 + SLACK):
+            radians = math.radians(value)
+            yield Finding(
+                "degrees",
+                path,
+                f"{value:.6g} is {abs(value) / TURN:.3g} turns of {name}, whose formulas take "
+                "radians; it looks like degrees",
+                f"write {radians!r}",
+                {"axis": name, "value": value, "radians": radians},
+            )
+    for k, name in enumerate(p.names):
+        if abs(trial.span[k] - 360) <= 1 and remedies.repeats(trial, k, TURN):
+            yield Finding(
+                "degrees",
+                f"state_box.{name}",
+                f"the axis of {name} is {trial.span[k]:.6g} long, and the map is the same when "
+                f"{name} is moved by 2 pi: the axis looks like degrees, the formulas take radians",
+                f'write "low": {math.radians(p.low[k])!r}, "high": {math.radians(p.high[k])!r}, '
+                f"or pi/180*{name} in the formulas",
+                {"axis": name, "length": float(trial.span[k])},
+            )
+
+
+def _coordinates(problem: Problem) -> Iterator[tuple[str, str, float]]:
+    """Yield the numbers of points and boxes of the attractor, with path and axis."""
+    attractor = problem.attractor
+    for i, point in enumerate(attractor.points):
+        named = point if isinstance(point, dict) else dict(zip(problem.states, point, strict=True))
+        for k, (name, value) in enumerate(named.items()):
+            last = f".{name}" if isinstance(point, dict) else f"[{k}]"
+            yield f"attractor.points[{i}]{last}", name, float(value)
+    for i, box in enumerate(attractor.boxes):
+        for name, ends in box.items():
+            for k, value in enumerate(ends):
+                yield f"attractor.boxes[{i}].{name}[{k}]", name, float(value)

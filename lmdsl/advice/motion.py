@@ -1,0 +1,242 @@
+"""Findings about how far and where to a step goes, of samples of the true map."""
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from lmdsl.advice.report import Finding
+from lmdsl.advice.survey import Survey
+from lmdsl.common.types import Bools, Floats, Indices
+from lmdsl.explanation import remedies
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model.grid.partition import MAX_CELLS, Partition
+
+STUCK = 0.02  # share of cells tried that keep their samples from which on a step is too short
+COVERED = 0.9  # share of the cells stabilized from which on no longer step is looked for
+WIDE = 2.0  # widths of a cell from which on the median sample moves far enough
+CURED = 0.1  # the part of that share that a remedy may leave
+EDGES = 0.1  # share of images on edges from which on that is no accident
+OVER = 0.9  # share of the samples on the way into A that jump over it, from which on a step is long
+JUMP = 0.25  # share of an axis above which a median move is no motion that has a way
+MOST_NEAR = 256  # number of cells beside A that are tried
+MOST_PLACES = 32  # number of places on the way of a sample
+
+
+def short_step(survey: Survey, share: float | None, deadline: Deadline) -> Iterator[Finding]:
+    """Find cells out of which no control moves any sample, or too little, and a step that does.
+
+    ``share`` is that of the problem's cells that can be stabilized, None if it is not known.
+    """
+    cells = survey.cells[survey.stays]
+    count, tried = len(cells), len(survey.cells)
+    if share == 1:
+        return  # a discount, say, ends what stays
+    many = count >= max(STUCK * tried, 1)
+    slow = tried > 0 and share is not None and share < COVERED
+    if not many and not (slow and float(np.median(survey.moved)) < WIDE):
+        return
+    of = survey.stays if many else np.ones(tried, dtype=np.bool_)
+    moved = float(np.median(survey.moved[of]))
+    figures: dict[str, Any] = {"cells": count, "tried": tried, "moved": moved}
+    parts = [*_longer(survey, cells, share, figures, deadline)]
+    if many:
+        parts += _other_cells(survey, cells, moved, figures, bool(parts))
+    if not parts:
+        return  # the map itself stays, or a longer step helps nothing
+    text = (
+        f"in {count} of {tried} cells tried no control moves any sample out of its cell"
+        f"{', so they are trapped' if count else ''}; under the control that moves it most the "
+        f"median sample {'of these ' if many else ''}moves {moved:.2g} widths of a cell"
+    )
+    where = "system.step" if "step" in figures else "system"
+    yield Finding("short_step", where, text, "; or ".join(parts), figures)
+
+
+def _longer(
+    survey: Survey, cells: Indices, share: float | None, figures: dict[str, Any], deadline: Deadline
+) -> Iterator[str]:
+    """Yield a longer step that helps, by its share where that is cheap to know."""
+    if share is not None:
+        better = remedies.better_step(survey.problem, share, deadline)
+        if better is not None:
+            longer: Any = better[0].system
+            figures |= _step(longer) | {"share": share, "share_then": better[1]}
+            yield (
+                f"write {_json(_step(longer))} in system: then {100 * better[1]:.3g} % of the "
+                f"cells can be stabilized instead of {100 * share:.3g} %"
+            )
+            return
+    for factor in remedies.FACTORS if len(cells) else ():
+        problem = remedies.longer_step(survey.problem, factor)
+        if problem is None:
+            return
+        left = int(survey.of(problem).stuck_share(cells) * len(cells) + 0.5)
+        if left <= CURED * len(cells):
+            figures |= _step(problem.system) | {"left": left}
+            yield f"write {_json(_step(problem.system))} in system: then {_left(left, len(cells))}"
+            return
+
+
+def _step(system: Any) -> dict[str, Any]:
+    return {"step": float(f"{system.step:.12g}"), "substeps": system.substeps}
+
+
+def _other_cells(
+    survey: Survey, cells: Indices, moved: float, figures: dict[str, Any], longer: bool
+) -> Iterator[str]:
+    """Yield more cells, or several steps at once."""
+    finer = _more_cells(survey, cells)
+    if finer is not None:
+        figures |= {"cells_needed": finer[0]}
+        yield f"write {_cells(finer[0])} in state_box: then {_left(finer[1], len(cells))}"
+        if not longer:
+            steps = max(int(np.ceil(1 / moved)), 2) if moved > 0 else 2
+            yield f"let the system be {steps} steps of its map at once"
+
+
+def _more_cells(survey: Survey, cells: Indices) -> tuple[dict[str, int], int] | None:
+    """Return the smallest of some larger numbers of cells that samples of these cells leave."""
+    places = survey.partition.centres(cells)
+    for factor in remedies.FACTORS:
+        own = {name: axis.cells * factor for name, axis in survey.problem.state_box.items()}
+        if np.prod([float(n) for n in own.values()]) > MAX_CELLS:
+            return None
+        finer = survey.of(remedies.with_cells(survey.problem, own))
+        at = finer.partition.locate(list(places.T))
+        left = int(finer.stuck_share(at) * len(cells) + 0.5)
+        if left <= CURED * len(cells):
+            return own, left
+    return None
+
+
+def _left(left: int, count: int) -> str:
+    return "none of these keeps its samples" if not left else f"{left} of these {count} are left"
+
+
+def _json(data: Any) -> str:
+    text = json.dumps(data)
+    return text[1:-1] if isinstance(data, dict) else text
+
+
+def _cells(cells: dict[str, int]) -> str:
+    return ", ".join(f'"cells": {count} for {name}' for name, count in cells.items())
+
+
+def on_edges(survey: Survey) -> Iterator[Finding]:
+    """Find axes on which images lie exactly on edges of cells, and numbers of cells that end it."""
+    for k in np.flatnonzero(survey.on_edge >= EDGES):
+        name, share = survey.partition.names[k], float(survey.on_edge[k])
+        text = (
+            f"{100 * share:.3g} % of the images of samples lie exactly on an edge between two "
+            f"cells of {name}, so that rounding decides where they go"
+        )
+        figures: dict[str, Any] = {"axis": name, "share": share}
+        found = _off_edges(survey, int(k))
+        if found is None:
+            remedy = "move low and high a little, or take random sample points"
+        else:
+            figures |= {"cells": found[0], "share_then": found[1]}
+            remedy = (
+                f'write "cells": {found[0]} for {name}: then {100 * found[1]:.3g} % do; or take '
+                'random sample points: "sampling": {"kind": "random", "points": 16, "seed": 0}'
+            )
+        yield Finding("on_edges", f"state_box.{name}.cells", text, remedy, figures)
+
+
+def _off_edges(survey: Survey, axis: int) -> tuple[int, float] | None:
+    name = survey.partition.names[axis]
+    count = survey.problem.state_box[name].cells
+    for cells in (count + 1, count + 2, count + 3, max(count - 1, 1)):
+        problem = remedies.with_cells(survey.problem, {name: cells})
+        share = survey.of(problem).edge_share(axis, survey.partition.centres(survey.cells))
+        if share <= CURED * float(survey.on_edge[axis]):
+            return cells, share
+    return None
+
+
+def long_step(survey: Survey) -> Iterator[Finding]:
+    """Find that samples beside A jump over it; nothing where the whole path is judged."""
+    if survey.sets is None or survey.problem.judged == "path":
+        return
+    p, attractor = survey.partition, survey.sets.attractor
+    if float(np.median(survey.moved)) * float((p.width / survey.span).min()) > JUMP:
+        return
+    cells = _beside(p, attractor, survey.sets.free)
+    if not len(cells):
+        return
+    landed, over, far = _ways(survey, cells, attractor)
+    if over == 0 or over < OVER * (landed + over):
+        return
+    text = (
+        f"of the samples beside A whose way leads into it, {100 * over / (landed + over):.3g} % "
+        f"jump over it; the median sample there moves {far:.2g} widths of A"
+    )
+    figures: dict[str, Any] = {"landing": landed, "jumping": over, "widths_of_attractor": far}
+    if remedies.longer_step(survey.problem, 1) is not None:
+        remedy = 'write "judged": "path" in system, so that a step that enters A on the way counts'
+        yield Finding("long_step", "system.step", text, remedy, figures)
+        return
+    remedy = f"make attractor {max(int(np.ceil(far)), 2)} times as wide, or let next be less time"
+    yield Finding("long_step", "attractor", text, remedy, figures)
+
+
+def _beside(p: Partition, attractor: Bools, free: Indices) -> Indices:
+    """Return free cells beside attractor cells, at most so many."""
+    random = np.random.default_rng(0)
+    inside = np.flatnonzero(attractor)
+    if len(inside) > MOST_NEAR:
+        inside = np.sort(random.choice(inside, MOST_NEAR, replace=False))
+    index = np.stack(p.multi_index(inside), axis=-1)
+    found = []
+    for k in range(p.dimension):
+        for side in (-1, 1):
+            at = index.copy()
+            at[:, k] += side
+            if p.periodic[k]:
+                at[:, k] %= p.cells[k]
+            good = (at[:, k] >= 0) & (at[:, k] < p.cells[k])
+            found.append(np.ravel_multi_index(tuple(at[good].T), p.shape))
+    near = np.intersect1d(np.concatenate(found), free)
+    if len(near) > MOST_NEAR:
+        near = np.sort(random.choice(near, MOST_NEAR, replace=False))
+    return near
+
+
+def _ways(survey: Survey, cells: Indices, attractor: Bools) -> tuple[int, int, float]:
+    """Return how many samples land in A, how many jump over it, and their median move.
+
+    The way of a sample is the straight line to its image; the move is in widths of A.
+    """
+    p = survey.partition
+    index = np.stack(p.multi_index(np.flatnonzero(attractor)), axis=-1)
+    widths = p.width * [_longest_run(np.unique(column)) for column in index.T]
+    landed = over = 0
+    moves = []
+    for begin in range(0, len(cells), max(1, survey.most_cells // MOST_PLACES)):
+        some = cells[begin : begin + max(1, survey.most_cells // MOST_PLACES)]
+        start = survey.start(some)
+        images = survey.images(start, survey.vectors())
+        shape = survey.shape(some)
+        far: Floats = np.zeros(shape)
+        for x, image, width in zip(start, images, widths, strict=True):
+            np.fmax(far, np.abs(image - x) / width, out=far)
+        moves.append(np.median(far, axis=(1, 2, 3)))
+        on_way = np.zeros(shape, dtype=np.bool_)
+        for part in np.arange(1, MOST_PLACES + 1) / MOST_PLACES:
+            at = [x + part * (image - x) for x, image in zip(start, images, strict=True)]
+            flat = np.broadcast_to(p.locate(at), shape)
+            inside = (flat >= 0) & attractor[flat]
+            if part == 1:
+                landed += int(inside.sum())
+                over += int((on_way & ~inside).sum())
+            on_way |= inside
+    return landed, over, float(np.median(np.concatenate(moves)))
+
+
+def _longest_run(values: Indices) -> int:
+    """Return the length of the longest run of consecutive integers."""
+    cuts = np.flatnonzero(np.diff(values) != 1)
+    ends = np.concatenate([[-1], cuts, [len(values) - 1]])
+    return int(np.diff(ends).max())

@@ -1,0 +1,126 @@
+"""What a check returns: findings, and what compiling takes and gives as far as a survey shows."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from lmdsl.common.records import Reported
+from lmdsl.machine import memory
+
+
+@dataclass(frozen=True)
+class Finding(Reported):
+    """Something that looks wrong.
+
+    Attributes
+    ----------
+    code
+        One of the codes in the documentation of ``lmdsl check``, such as ``short_step``.
+    where
+        The path of the field at fault.
+    text
+        What was seen, one sentence.
+    remedy
+        What to write instead.
+    figures
+        The numbers behind it, by name.
+    """
+
+    code: str
+    where: str
+    text: str
+    remedy: str
+    figures: dict[str, Any]
+
+    def __str__(self) -> str:
+        return f"{self.code}, {self.where}: {self.text}\n  remedy: {self.remedy}"
+
+
+@dataclass(frozen=True)
+class Expectation(Reported):
+    """What compiling a problem takes and gives, as far as a survey shows.
+
+    Attributes
+    ----------
+    cells, controls, samples
+        Number of cells, of control vectors, and of samples of a pair of both.
+    admissible
+        Share of the pairs from which no sample leaves.
+    coverage
+        Share of the cells outside attractor and avoid that can be stabilized; null if unknown.
+    coverage_cells
+        The cells of each axis for which it was computed; the problem's own where that is cheap.
+    memory, available
+        Bytes that compiling and solving take, and that are left.
+    seconds
+        Seconds that compiling takes, roughly.
+    """
+
+    cells: int
+    controls: int
+    samples: int
+    admissible: float
+    coverage: float | None
+    coverage_cells: dict[str, int] | None
+    memory: int
+    available: int
+    seconds: float
+
+    def lines(self, own: dict[str, int]) -> list[str]:
+        """Return sentences; ``own`` are the problem's own cells of each axis."""
+        lines = [
+            f"{self.cells:,} cells, {self.controls:,} controls, {self.samples:,} samples of each "
+            f"pair; {100 * self.admissible:.3g} % of the pairs tried are admissible"
+        ]
+        if self.coverage is None:
+            lines.append("coverage: not known without the whole compilation")
+        else:
+            of = "" if self.coverage_cells == own else f" on a grid of {shape(self.coverage_cells)}"
+            lines.append(f"coverage: {100 * self.coverage:.3g} % can be stabilized{of}")
+        lines.append(
+            f"memory: about {memory.human(self.memory)} of {memory.human(self.available)}; "
+            f"compiling takes about {_seconds(self.seconds)}"
+        )
+        return lines
+
+
+def shape(cells: dict[str, int] | None) -> str:
+    """Return the cells of each axis as text, such as "40 x 30 cells"."""
+    return " x ".join(str(count) for count in (cells or {}).values()) + " cells"
+
+
+def _seconds(seconds: float) -> str:
+    if seconds < 2:
+        return "a second"
+    if seconds < 120:
+        return f"{seconds:.0f} seconds"
+    return f"{seconds / 60:.0f} minutes" if seconds < 7200 else f"{seconds / 3600:.3g} hours"
+
+
+@dataclass(frozen=True)
+class CheckReport(Reported):
+    """What looks wrong with a problem before the long run.
+
+    Attributes
+    ----------
+    findings
+        What looks wrong, in the order of the keys of a problem file; empty where nothing does.
+    expected
+        What compiling takes and gives, as far as a survey shows.
+    axes
+        The cells of each axis.
+    """
+
+    findings: tuple[Finding, ...]
+    expected: Expectation
+    axes: dict[str, int]
+
+    def __bool__(self) -> bool:
+        """Return whether something was found."""
+        return bool(self.findings)
+
+    def text(self) -> str:
+        """Return the report for people."""
+        found = [str(finding) for finding in self.findings] or ["nothing looks wrong"]
+        return "\n\n".join(["\n".join(self.expected.lines(self.axes)), *found])
+
+    __str__ = text

@@ -1,0 +1,225 @@
+"""What compiling a problem takes and gives: of itself where that is cheap, else on fewer cells."""
+
+import json
+import math
+import time
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lmdsl.advice.report import Expectation, Finding, shape
+from lmdsl.advice.survey import Survey
+from lmdsl.errors import BadInput
+from lmdsl.explanation import remedies
+from lmdsl.explanation.remedies import StabilizableShare
+from lmdsl.explanation.trials import some
+from lmdsl.machine import memory, threads
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model import discretization
+from lmdsl.model.assembly import estimates
+from lmdsl.model.assembly.sampler import Block, Sampler
+from lmdsl.model.assembly.transitions import Assembler, shares_of
+from lmdsl.model.sets import CellSets
+from lmdsl.problem.problem import Problem
+
+# Additions above which compiling is no survey: on the problem's own cells, and on others.
+OWN_WORK, WORK = 6e9, 1e9
+ALIKE = 0.1  # difference of the shares on two grids up to which the finer says what finer ones give
+FUNCTION = 1e5  # additions for which a sample of a map counts of which nobody knows
+# Number of samples that are compiled to tell the time: of formulas, and of a user's own function.
+MOST_SAMPLES, FEW_SAMPLES = 2**20, 2**12
+LEAST = 100  # number of free cells below which a share says little
+FALLEN = 0.9  # the part of a share below which it has fallen
+
+
+class Level(NamedTuple):
+    """A problem on some number of cells, compiled."""
+
+    problem: Problem
+    cells: dict[str, int]
+    found: StabilizableShare
+    seconds: float
+
+
+def work(problem: Problem) -> float:
+    """Return the additions that compiling takes, about; of a function a guess."""
+    known = estimates.work(problem)
+    if known < np.inf:
+        return known
+    N = float(np.prod([float(axis.cells) for axis in problem.state_box.values()]))
+    samples = discretization.sample_points(problem) * discretization.node_count(problem)
+    return N * discretization.control_count(problem) * samples * FUNCTION
+
+
+def levels(problem: Problem, deadline: Deadline) -> list[Level]:
+    """Compile a problem on the most cells, by halves or doubles of its own, that are cheap.
+
+    Returns
+    -------
+    levels
+        On half as many cells an axis first, then on those; empty where neither can be. The numbers
+        of cells are at most twice the problem's own.
+    """
+    bare = problem.replaced(measure=None, local_controller=None)
+    found: list[Level] = []
+    for power in (1, 0, -1, -2, -3, -4, -5, -6):
+        cells = {
+            name: max(round(axis.cells * 2.0**power), 1) for name, axis in bare.state_box.items()
+        }
+        own = power == 0
+        if not own and (problem.attractor.cells or max(cells.values()) > 2**30):
+            continue
+        scaled = bare if own else remedies.with_cells(bare, cells)
+        if work(scaled) > (OWN_WORK if own else WORK):
+            continue
+        if not memory.fits(estimates.estimate(scaled)):
+            continue
+        start = time.perf_counter()
+        try:
+            covered = remedies.coverage(scaled, deadline)
+        except BadInput:
+            if own:  # a fault of the problem itself: its cost, say
+                raise
+            if power < 0:  # a box of the attractor that holds no cell of this size
+                break
+            continue
+        found.insert(0, Level(scaled, cells, covered, time.perf_counter() - start))
+        if len(found) == 3 or (len(found) == 2 and power < 0):
+            break
+    return found
+
+
+def expected(survey: Survey, known: list[Level]) -> Expectation:
+    """Return what compiling takes and gives."""
+    problem, p = survey.problem, survey.partition
+    own = {name: axis.cells for name, axis in problem.state_box.items()}
+    few, each = estimates.Pilot(), 0.0
+    if survey.sets is not None and len(survey.sets.free):
+        sampler = Sampler(problem, p, sets=survey.sets)
+        few, each = _few(sampler, survey, survey.sets)
+    level = _telling(known, own)
+    return Expectation(
+        cells=p.size,
+        controls=discretization.control_count(problem),
+        samples=discretization.sample_points(problem) * discretization.node_count(problem),
+        admissible=few.admissible,
+        coverage=None if level is None else level.found.share,
+        coverage_cells=None if level is None else level.cells,
+        memory=estimates.estimate(problem, few),
+        available=memory.available().bytes,
+        seconds=each * p.size * discretization.control_count(problem),
+    )
+
+
+def of_matrices(problem: Problem, deadline: Deadline) -> tuple[Level, Expectation]:
+    """Compile a finite model: there is no map to try."""
+    cells = {name: axis.cells for name, axis in problem.state_box.items()}
+    start = time.perf_counter()
+    covered = remedies.coverage(problem, deadline)
+    level = Level(problem, cells, covered, time.perf_counter() - start)
+    return level, Expectation(
+        cells=math.prod(cells.values()),
+        controls=discretization.control_count(problem),
+        samples=1,
+        admissible=1.0,
+        coverage=covered.share,
+        coverage_cells=cells,
+        memory=estimates.estimate(problem),
+        available=memory.available().bytes,
+        seconds=level.seconds,
+    )
+
+
+def _few(sampler: Sampler, survey: Survey, sets: CellSets) -> tuple[estimates.Pilot, float]:
+    """Compile a few cells, and refuse a cost that compiling all would; return seconds a pair."""
+    shares = shares_of(survey.problem, len(sampler.points), sampler.nodes)
+    assembler, blocks = Assembler(sampler, sets, shares), _blocks(sampler, survey)
+    assembler(blocks[0])  # kernels are compiled
+    start = time.perf_counter()
+    rows = [assembler(block)[1] for block in blocks]
+    seconds = time.perf_counter() - start
+    tried = sum(block.lanes for block in blocks)
+    kept, entries = (sum(len(part) for part in parts) for parts in
+                     ([row.control for row in rows], [row.target for row in rows]))  # fmt: skip
+    few = estimates.Pilot(kept / tried, entries / kept if kept else 1.0)
+    return few, seconds / tried / threads.count()
+
+
+def _blocks(sampler: Sampler, survey: Survey) -> list[Block]:
+    """Return blocks of some of the cells with some or all controls."""
+    most = MOST_SAMPLES if survey.quick else FEW_SAMPLES
+    M, S = len(sampler.controls), sampler.samples
+    width = min(M, max(1, most // S))
+    cells = some(survey.cells, max(1, most // (width * S)))
+    size = max(1, sampler.chunk // (width * S))
+    firsts = np.linspace(0, M - width, -(-len(cells) // size)).astype(int).tolist()
+    return [
+        Block(0, cells[i * size : (i + 1) * size], (first, first + width))
+        for i, first in enumerate(firsts)
+    ]
+
+
+def _telling(known: list[Level], own: dict[str, int]) -> Level | None:
+    """Return the level whose share is that of the problem, about; None if none is."""
+    for level in known:
+        if level.cells == own:
+            return level
+    if len(known) > 1 and abs(known[-1].found.share - known[-2].found.share) <= ALIKE:
+        return known[-1]
+    return None
+
+
+def too_large(found: Expectation) -> Iterator[Finding]:
+    """Find that a problem does not fit in memory."""
+    if found.memory > found.available:
+        part = found.available / found.memory
+        yield Finding(
+            "memory",
+            "state_box",
+            f"compiling and solving take about {memory.human(found.memory)}, and "
+            f"{memory.human(found.available)} are left",
+            f"take {100 * part:.2g} % of the cells, controls or sample points, or more memory",
+            {"memory": found.memory, "available": found.available},
+        )
+
+
+def shrinking(problem: Problem, known: list[Level], deadline: Deadline) -> Iterator[Finding]:
+    """Find that an attractor of points loses cells as it shrinks, and a box that does not."""
+    if not problem.attractor.points or len(known) < 2:
+        return
+    last, finest = known[-2:]
+    if min(last.found.free, finest.found.free) < LEAST:
+        return
+    if not finest.found.share < FALLEN * last.found.share:
+        return
+    shares = {shape(one.cells): one.found.share for one in known}
+    told = ", ".join(f"{100 * share:.3g} % on {cells}" for cells, share in shares.items())
+    text = (
+        f"the attractor is the cells around points, which shrinks with them, and less can be "
+        f"stabilized the more cells there are: {told}"
+    )
+    figures: dict[str, Any] = {"shares": shares}
+    best = max(known, key=lambda one: one.found.share)
+    fixed = remedies.attractor_boxes(best.problem)
+    boxed = finest.problem.replaced(attractor={"boxes": fixed})
+    share = remedies.coverage(boxed, deadline).share
+    remedy = f'write "boxes": {json.dumps(fixed)} in attractor instead of points'
+    if share > finest.found.share:
+        figures |= {"boxes": fixed, "share_with_boxes": share}
+        remedy += f": then {100 * share:.3g} % on {shape(finest.cells)}"
+    yield Finding("shrinking_attractor", "attractor.points", text, remedy, figures)
+
+
+def nothing(known: list[Level], own: dict[str, int]) -> Iterator[Finding]:
+    """Find that no cell can be stabilized on the problem's own grid."""
+    for level in known:
+        if level.cells == own and level.found.free and not level.found.stabilizable:
+            yield Finding(
+                "nothing_stabilizable",
+                "state_box",
+                f"none of the {level.found.free} cells outside attractor and avoid can be "
+                "stabilized",
+                "`lmdsl explain FILE` says why, region by region, and what would help",
+                {"cells": level.found.free},
+            )

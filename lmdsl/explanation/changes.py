@@ -1,0 +1,120 @@
+"""Hints of changes for which a problem was compiled again: the cause itself is removed.
+
+longer step     cells keep all of their samples under every control, or too few can be stabilized:
+                with a longer step more can be.
+periodic axis   the map does not change when a state is moved by the length of its axis: with the
+                axis declared periodic more can be stabilized.
+box attractor   the attractor is the cells around points: with a box that also has the cells around
+                these, more can be stabilized, and it does not shrink with the cells.
+
+A hint is given if the share of the cells that can be stabilized rises by at least a tenth, and
+where compiling takes a moment. The figures are those of the compilations.
+"""
+
+import json
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from lmdsl.common.types import Statuses
+from lmdsl.errors import BadInput
+from lmdsl.explanation import remedies
+from lmdsl.explanation.hints import Hint, hints
+from lmdsl.explanation.trials import MapTrial, some
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.stabilizable_set import LOST, CellStatus
+from lmdsl.problem.problem import Problem
+from lmdsl.systems import MatrixSystem
+
+GROWTH = (1, 2, 4)  # number of cells by which the attractor is tried to grow on every side
+
+
+def every_hint(
+    problem: Problem, partition: Partition, status: Statuses, deadline: Deadline
+) -> tuple[Hint, ...]:
+    """Return what helps, as far as it was tried in time; a finite model has no map to try."""
+    found: list[Hint] = []
+    with suppress(TimeLimitReached):
+        if not isinstance(problem.system, MatrixSystem):
+            found += changes(problem, partition, status, deadline)
+            found += hints(problem, partition, status, deadline)
+    return tuple(found)
+
+
+def changes(
+    problem: Problem, partition: Partition, status: Statuses, deadline: Deadline
+) -> Iterator[Hint]:
+    """Yield the hints that compilations support, given the status of all cells (N,)."""
+    lost = int(np.isin(status, LOST).sum())
+    if not lost:
+        return
+    kept = int((status == CellStatus.STABILIZED).sum())
+    share = kept / (kept + lost)
+    bare = problem.replaced(measure=None, local_controller=None)
+    yield from _longer_step(MapTrial(bare, partition, deadline), status, share, deadline)
+    yield from _periodic(MapTrial(bare, partition, deadline), share, deadline)
+    yield from _box(bare, share, deadline)
+
+
+def _gain(share: float, then: float) -> str:
+    return f"{100 * then:.3g} % of the cells can be stabilized instead of {100 * share:.3g} %"
+
+
+def _longer_step(
+    trial: MapTrial, status: Statuses, share: float, deadline: Deadline
+) -> Iterator[Hint]:
+    better = remedies.better_step(trial.problem, share, deadline)
+    if better is None:
+        return
+    cells = some(np.flatnonzero(np.isin(status, LOST)), trial.most_cells)
+    stuck = int(trial.stuck(cells).sum())
+    system: Any = better[0].system
+    step = float(f"{system.step:.12g}")
+    text = (
+        f'a longer step: with "step": {step!r}, "substeps": {json.dumps(system.substeps)}, '
+        f"{_gain(share, better[1])}; {stuck} of {len(cells)} lost cells tried keep all of their "
+        "samples under every control now"
+    )
+    numbers = {
+        "step": step, "substeps": system.substeps, "share": share, "share_then": better[1],
+        "stuck": stuck, "tried": len(cells),
+    }  # fmt: skip
+    yield Hint("longer step", text, numbers)
+
+
+def _periodic(trial: MapTrial, share: float, deadline: Deadline) -> Iterator[Hint]:
+    for k, period in remedies.hidden_periods(trial):
+        name = trial.partition.names[k]
+        then = remedies.share_on_circle(trial.problem, name, period, deadline)
+        if then is None or then < share + remedies.GAIN:
+            continue
+        words = remedies.circle_words(trial.problem, name, period)
+        text = (
+            f"a periodic axis: the map is the same when {name} is moved by {period:.7g}; with "
+            f"{words}, {_gain(share, then)}"
+        )
+        numbers = {"axis": name, "period": period, "share": share, "share_then": then}
+        yield Hint("periodic axis", text, numbers)
+
+
+def _box(problem: Problem, share: float, deadline: Deadline) -> Iterator[Hint]:
+    if not problem.attractor.points or not remedies.cheap(problem, remedies.TRIAL):
+        return
+    for grow in GROWTH:
+        boxes = remedies.attractor_boxes(problem, grow)
+        try:
+            then = remedies.coverage(problem.replaced(attractor={"boxes": boxes}), deadline).share
+        except BadInput:  # it meets avoid
+            return
+        if then >= share + remedies.GAIN:
+            text = (
+                f'a box as attractor: with "boxes": {json.dumps(boxes)} instead of points, '
+                f"{_gain(share, then)}; it keeps its size when there are more cells, while that "
+                "of points shrinks"
+            )
+            numbers = {"boxes": boxes, "cells_around": grow, "share": share, "share_then": then}
+            yield Hint("box attractor", text, numbers)
+            return

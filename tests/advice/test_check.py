@@ -1,0 +1,392 @@
+"""``check``: every finding where it must be found, and none where nothing is wrong."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+from problems import made, standard_map
+
+import lmdsl as lm
+from lmdsl.advice import sizes
+
+PI = math.pi
+
+
+def pendulum(step=0.1, *, periodic=True, attractor=None, **more):
+    """A pendulum, upright at 0."""
+    box = {"th": [-0.3, 0.3], "om": [-0.8, 0.8]}
+    return {
+        "format": "lmdsl/1",
+        "system": {
+            "kind": "ode",
+            "parameters": {"g": 9.81},
+            "derivative": {"th": "om", "om": "g*sin(th) + u"},
+            "step": step,
+            "substeps": 1,
+        },
+        "state_box": {
+            "th": {"low": -PI, "high": PI, "cells": 30, "periodic": periodic},
+            "om": {"low": -8, "high": 8, "cells": 30},
+        },
+        "attractor": attractor or {"boxes": [box]},
+        "control_grid": {"u": {"low": -4, "high": 4, "points": 5}},
+        "stage_cost": "1",
+        "sampling": {"kind": "grid", "per_axis": 3},
+        **more,
+    }
+
+
+def shift(move="0.5*u", low=-4, high=4, cells=16, controls=(-1, 0, 1), per_axis=1, **more):
+    """x+ = x + a move, A around 0."""
+    return {
+        "format": "lmdsl/1",
+        "system": {"kind": "map", "next": {"x": f"x + {move}"}},
+        "state_box": {"x": {"low": low, "high": high, "cells": cells}},
+        "attractor": {"boxes": [{"x": [-0.5, 0.5]}]},
+        "control_grid": {"u": {"values": list(controls)}},
+        "stage_cost": "1",
+        "sampling": {"kind": "grid", "per_axis": per_axis},
+        **more,
+    }
+
+
+def found(data):
+    report = lm.check(made(data))
+    json.dumps(report.to_dict(), allow_nan=False)
+    assert str(report) == report.text()
+    for finding in report.findings:
+        assert finding.text in str(report)
+        assert finding.remedy in str(report)
+    return {finding.code: finding for finding in report.findings}
+
+
+# Nothing is wrong ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("data", [pendulum(), shift(), standard_map(20)])
+def test_nothing_is_found_where_nothing_is_wrong(data):
+    report = lm.check(made(data))
+    assert not report
+    assert not report.findings
+    assert "nothing looks wrong" in str(report)
+
+
+SHIPPED = [
+    "henon_map", "inverted_pendulum", "logistic_map", "standard_map", "standard_map_held",
+    "van_der_pol",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_problems_look_right(name):
+    assert not lm.check(lm.load(f"examples/{name}.json"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["lorenz", "pendulum_on_cart"])
+def test_larger_shipped_problems_look_right(name):
+    assert not lm.check(lm.load(f"examples/{name}.json"))
+
+
+# Steps -----------------------------------------------------------------------------------------
+
+
+def test_a_step_so_short_that_cells_stay_put():
+    finding = found(pendulum(0.01))["short_step"]
+    figures = finding.figures
+    assert finding.where == "system.step"
+    assert 0 < figures["cells"] <= figures["tried"]
+    assert figures["moved"] < 1
+    # The remedy does what it says.
+    system = {"step": figures["step"], "substeps": figures["substeps"]}
+    assert json.dumps(system)[1:-1] in finding.remedy
+    data = pendulum()
+    data["system"] |= system
+    coverage = lm.solve(made(data)).coverage
+    assert coverage.share == pytest.approx(figures["share_then"])
+    assert figures["share_then"] >= figures["share"] + 0.1
+
+
+def test_a_step_that_moves_every_cell_may_still_be_too_short():
+    figures = found(pendulum(0.02))["short_step"].figures
+    assert figures["cells"] <= 0.02 * figures["tried"]
+    assert figures["share"] < 0.1 < 0.8 < figures["share_then"]
+
+
+def test_a_map_that_moves_too_little():
+    finding = found(shift("0.01*u"))["short_step"]
+    assert finding.figures["cells"] == finding.figures["tried"] == 14
+    assert finding.figures["moved"] == pytest.approx(0.02)
+    # 0.01 moves the middle of a cell over its edge from a width of 0.02 on: 512 cells, not 256.
+    assert finding.figures["cells_needed"] == {"x": 512}
+    assert "51 steps" in finding.remedy or "50 steps" in finding.remedy
+
+
+def test_no_step_is_too_short_for_a_map_that_rests():
+    assert "short_step" not in found(shift("0*u"))
+
+
+def test_a_step_that_jumps_over_the_attractor():
+    jumping = shift("0.9*u", cells=80, controls=(-1, 1), attractor={"boxes": [{"x": [-0.1, 0.1]}]})
+    finding = found(jumping)["long_step"]
+    assert finding.figures["landing"] == 0
+    assert finding.figures["widths_of_attractor"] == pytest.approx(4.5)
+    landing = shift("0.9*u", cells=80, attractor={"boxes": [{"x": [-0.5, 0.5]}]})
+    assert "long_step" not in found(landing)
+
+
+def test_jumping_does_not_matter_where_the_path_is_judged():
+    system = {"kind": "ode", "derivative": {"x": "u"}, "step": 0.9}
+    for judged, expected in (("endpoint", True), ("path", False)):
+        data = shift(cells=80, controls=(-1, 1), attractor={"boxes": [{"x": [-0.1, 0.1]}]})
+        data["system"] = {**system, "judged": judged}
+        report = found(data)
+        assert ("long_step" in report) == expected
+        if expected:
+            assert '"judged": "path"' in report["long_step"].remedy
+
+
+# Attractors ------------------------------------------------------------------------------------
+
+
+def test_an_attractor_of_points_that_shrinks_with_the_cells():
+    # 88, 59, 30, 15 % stabilizable on 1, 2, 4, 8 times the cells an axis.
+    problem = lm.load("examples/double_integrator.json")
+    (finding,) = lm.check(problem).findings
+    assert finding.code == "shrinking_attractor"
+    shares = finding.figures["shares"]
+    assert shares["80 x 60 cells"] == pytest.approx(0.88, abs=0.01)
+    assert shares["160 x 120 cells"] == pytest.approx(0.59, abs=0.01)
+    boxes = finding.figures["boxes"]
+    assert boxes == [{"x": (-0.05, 0.05), "v": (-0.05, 0.05)}]
+    # A box is the cure.
+    box = problem.replaced(attractor={"boxes": boxes})
+    assert not lm.check(box)
+    axes = {name: axis.replaced(cells=2 * axis.cells) for name, axis in problem.state_box.items()}
+    lp = lm.compile(box.replaced(state_box=axes))
+    share = (lp.cell_status == lm.CellStatus.STABILIZED).mean()
+    assert share == pytest.approx(finding.figures["share_with_boxes"], abs=0.001)
+    assert share > 0.85
+
+
+def test_points_do_not_matter_where_they_suffice():
+    data = standard_map(20)
+    assert "points" in data["attractor"]
+    assert "shrinking_attractor" not in found(data)
+
+
+def test_degrees():
+    degrees = {"points": [{"th": 180, "om": 0}]}
+    finding = found(pendulum(attractor=degrees))["degrees"]
+    assert finding.where == "attractor.points[0].th"
+    assert finding.figures["radians"] == pytest.approx(PI)
+    assert "degrees" not in found(pendulum(attractor={"points": [{"th": PI, "om": 0}]}))
+    assert "degrees" not in found(pendulum(attractor={"points": [{"th": 3 * PI / 2, "om": 0}]}))
+    lists = found(pendulum(attractor={"points": [[90, 0]]}))
+    assert lists["degrees"].where == "attractor.points[0][0]"
+
+
+def test_an_axis_in_degrees():
+    data = pendulum(attractor={"boxes": [{"th": [-24, 24], "om": [-0.8, 0.8]}]})
+    data["state_box"]["th"] |= {"low": -180, "high": 180}
+    assert found(data)["degrees"].where == "state_box.th"
+    data["system"]["derivative"] = {"th": "om", "om": "g*sin(pi/180*th) + u"}
+    assert "degrees" not in found(data)
+
+
+# Axes ------------------------------------------------------------------------------------------
+
+
+def test_an_angle_that_is_not_declared_periodic():
+    report = found(pendulum(periodic=False))
+    finding = report["not_periodic"]
+    assert finding.where == "state_box.th"
+    assert finding.figures["period"] == pytest.approx(2 * PI)
+    assert finding.figures["share_then"] > finding.figures["share"] + 0.1
+    coverage = lm.solve(made(pendulum())).coverage
+    assert finding.figures["share_then"] == pytest.approx(coverage.share)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-3.14, 3.14), (-3.5, 3.5), (0, 6.2831853)])
+def test_an_angle_of_about_a_turn(low, high):
+    data = pendulum(periodic=False)
+    data["state_box"]["th"] |= {"low": low, "high": high}
+    finding = found(data)["not_periodic"]
+    axis = {
+        name: json.loads(word)
+        for name, word in (
+            part.strip('"').split('": ') for part in finding.remedy[6:].split(", ")[:2]
+        )
+    }
+    assert axis["high"] - axis["low"] == pytest.approx(2 * PI)
+
+
+@pytest.mark.parametrize(
+    ("next_", "box"),
+    [
+        ("x + 0.1*u", (0, 1)),  # moved along with the state: no circle
+        ("0.5*x + 0.1*u", (0, 1)),
+        ("0.5", (0, 1)),
+        ("where(x < 1, 0.2, 0.7)", (0, 1)),  # images that do not depend on where outside
+        ("x + 0.1*sin(2*pi*x) + 0.1*u", (0, 0.9)),  # not the whole circle
+        ("x + 0.1*sin(pi*x) + 0.1*u", (0, 1)),  # half of it
+    ],
+)
+def test_no_circle(next_, box):
+    data = shift(low=box[0], high=box[1], attractor={"points": [[0.5]]})
+    data["system"]["next"]["x"] = next_
+    assert "not_periodic" not in found(data)
+
+
+def test_a_circle_of_length_one():
+    data = shift(low=0, high=1, attractor={"points": [[0.5]]})
+    data["system"]["next"]["x"] = "x + 0.1*sin(2*pi*x) + 0.1*u"
+    assert found(data)["not_periodic"].figures["period"] == 1
+    data["state_box"]["x"]["periodic"] = True
+    assert "not_periodic" not in found(data)
+
+
+def test_images_that_lie_on_edges():
+    # The middle of a cell of width 1 goes by 0.5 to an edge; with widths of 0.9 it does not.
+    at = {"attractor": {"points": [[0.25]]}}
+    finding = found(shift(low=-4.5, high=4.5, cells=9, **at))["on_edges"]
+    assert finding.where == "state_box.x.cells"
+    assert finding.figures["share"] > 0.5
+    assert finding.figures["cells"] == 10
+    assert finding.figures["share_then"] == 0
+    assert "on_edges" not in found(shift(low=-4.5, high=4.5, cells=10, **at))
+    assert "on_edges" not in found(shift(low=-4.5, high=4.5, cells=9, per_axis=2, **at))
+
+
+def test_images_at_the_ends_of_an_axis_are_no_accident():
+    data = shift("9*u", on_exit="clip")
+    assert "on_edges" not in found(data)
+
+
+# Names -----------------------------------------------------------------------------------------
+
+
+def test_names_that_no_formula_uses():
+    data = pendulum(
+        control_grid={"u": {"low": -4, "high": 4, "points": 3}, "v": {"values": [0]}},
+        noise={"w": {"values": [0], "weights": [1]}},
+        let={"used": "u**2", "idle": "u"},
+        stage_cost="1 + used",
+    )
+    data["system"]["parameters"]["k"] = 1
+    where = [f.where for f in lm.check(made(data)).findings if f.code == "unused"]
+    assert where == ["system.parameters.k", "let.idle", "control_grid.v", "noise.w"]
+
+
+def test_named_systems_and_functions_use_their_own_names():
+    system = {"kind": "van_der_pol", "parameters": {"mu": 2}}
+    problem = lm.load("examples/van_der_pol.json").replaced(system=system)
+    assert not [f for f in lm.check(problem).findings if f.code == "unused"]
+
+    def step(x, u, a):
+        return {"x": x + a * u}
+
+    own = lm.systems.FunctionSystem(next=step, parameters={"a": 0.5})
+    for more in ({}, {"stage_cost": lambda x, u: 1 + 0 * x}):
+        report = lm.check(lm.Problem(**{**shift(), "system": own, **more}))
+        assert not report
+        assert report.expected.coverage == 1
+
+
+def test_a_slow_function_is_asked_a_few_times():
+    calls = []
+
+    def step(th, om, u):
+        calls.append(1)
+        return {"th": th + 0.1 * om, "om": om + 0.1 * (9.81 * math.sin(th) + u)}
+
+    own = lm.systems.FunctionSystem(next=step, vectorized=False)
+    data = pendulum(periodic=False)
+    data["control_grid"]["u"]["points"] = 101
+    report = lm.check(lm.Problem(**{**data, "system": own}))
+    assert len(calls) < 100_000
+    assert [finding.code for finding in report.findings] == ["not_periodic"]
+    assert report.expected.coverage is None
+
+
+# What it takes ---------------------------------------------------------------------------------
+
+
+def test_what_is_expected():
+    expected = lm.check(made(pendulum())).expected
+    result = lm.solve(made(pendulum()))
+    assert expected.cells == result.cells == 900
+    assert expected.controls == 5
+    assert expected.samples == 9
+    assert expected.coverage == pytest.approx(result.coverage.share)
+    assert 0.8 < expected.admissible <= 1
+    assert 0 < expected.memory < expected.available
+    assert expected.seconds >= 0
+
+
+def test_nothing_can_be_stabilized():
+    report = found(shift("0*u"))
+    assert report["nothing_stabilizable"].figures["cells"] == 14
+    assert lm.check(made(shift("0*u"))).expected.coverage == 0
+
+
+@pytest.mark.parametrize("cells", [2_000, 40_000])
+def test_large_problems_are_checked_on_fewer_cells(cells):
+    data = pendulum()
+    for axis in data["state_box"].values():
+        axis["cells"] = cells
+    data["control_grid"]["u"]["points"] = 201
+    report = lm.check(made(data))
+    assert report.expected.cells == cells**2
+    assert report.expected.coverage is None or report.expected.coverage_cells["th"] < cells
+    codes = [finding.code for finding in report.findings]
+    assert ("memory" in codes) == (report.expected.memory > report.expected.available)
+
+
+def test_a_problem_that_does_not_fit(monkeypatch):
+    monkeypatch.setattr(sizes.memory, "available", lambda: sizes.memory.Memory(10**6, "a test"))
+    problem = lm.load("examples/logistic_map.json")
+    finding = next(f for f in lm.check(problem).findings if f.code == "memory")
+    assert finding.figures["memory"] > finding.figures["available"] == 10**6
+
+
+@pytest.mark.parametrize("cost", ["x", "log(x)", "1/x"])
+def test_a_cost_that_cannot_be_is_bad_input(cost):
+    with pytest.raises(lm.BadInput, match="stage_cost"):
+        lm.check(made(shift(stage_cost=cost, low=-4, cells=15, controls=(0,))))
+
+
+def test_a_finite_model_has_no_map_to_try():
+    P = [[[1, 0], [0, 1]], [[0, 1], [0, 1]]]
+    report = lm.check(lm.from_matrices(P, cost=[[1, 1], [0, 0]], targets=[1], layout="states"))
+    assert not report
+    assert report.expected.coverage == 1
+    report = lm.check(lm.from_matrices(P[:1], cost=[[1], [0]], targets=[1], layout="states"))
+    assert [finding.code for finding in report.findings] == ["nothing_stabilizable"]
+
+
+def test_a_discounted_problem_needs_no_attractor_and_no_step():
+    data = pendulum(0.01, discount=0.9)
+    data["attractor"] = {}
+    data["on_exit"] = "clip"
+    report = lm.check(made(data))
+    assert not report
+    assert report.expected.coverage == 1
+
+
+def test_what_is_no_problem_is_refused():
+    with pytest.raises(lm.BadInput, match="a Problem"):
+        lm.check("problem.json")
+
+
+def test_boxes_of_an_attractor_across_the_seam():
+    data = standard_map(20, attractor={"points": [{"x": 0, "y": 0.5}]})
+    from lmdsl.explanation.remedies import attractor_boxes
+
+    for grow in (0, 1, 3):
+        boxes = attractor_boxes(made(data), grow)
+        problem = made({**data, "attractor": {"boxes": boxes}})
+        cells = (lm.compile(problem).cell_status == lm.CellStatus.ATTRACTOR).sum()
+        assert cells == (2 + 2 * grow) ** 2
