@@ -24,6 +24,7 @@ from lmdsl.problem.local_control import ConstantControl
 from lmdsl.problem.problem import Problem
 from lmdsl.systems import DataSystem, MatrixSystem
 from lmdsl.systems.matrices.system import Draws
+from lmdsl.systems.named import NotStored
 
 REACHED, LOST, CYCLING = 0, 1, 2
 LOSSES = ("outside", "avoid", "no_control")  # where runs are lost: of the box, or such a cell
@@ -166,7 +167,11 @@ class ClosedLoop:
             return moved
         named = self.true_map.named(list(x.T), list(u.T), w)
         given = 0.0 if self.draws is None else moved.cost
-        return moved._replace(cost=given + np.broadcast_to(self._stage(named, guard)[0], len(x)))
+        try:
+            (stage,) = self._stage(named, guard)
+        except NotStored:  # only a saved result is at hand: the runs are known, their costs not
+            stage = np.array(np.nan)
+        return moved._replace(cost=given + np.broadcast_to(stage, len(x)))
 
     def run(
         self, x: Floats, steps: int, rng: np.random.Generator, deadline: Deadline = FOREVER

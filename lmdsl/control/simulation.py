@@ -201,8 +201,8 @@ def simulate(
 
 
 def _mean(cost: Floats) -> dict[str, float | None] | None:
-    """Return the mean cost of runs and its standard error; None without any."""
-    if not len(cost):
+    """Return the mean cost of runs and its standard error; None where none is known."""
+    if not len(cost) or np.isnan(cost).any():
         return None
     with np.errstate(all="ignore"):
         error = float(cost.std(ddof=1) / np.sqrt(len(cost))) if len(cost) > 1 else None
