@@ -17,7 +17,7 @@ from lmdsl.formulas.enclosures import Jet, apply, enclosure
 from lmdsl.formulas.intervals import Interval, subtract
 from lmdsl.formulas.program import FUNCTION
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
-from lmdsl.model.discretization import noise_nodes
+from lmdsl.model.discretization import noise_nodes, noise_parts
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
 from lmdsl.model.true_map import TrueMap
@@ -46,7 +46,8 @@ class LocalCheck(Reported):
     cells
         Number of attractor cells.
     proved
-        Of these, cells whose every point is mapped into A: enclosed by interval arithmetic. None
+        Of these, cells whose every point is mapped into A by all noise that enclosures cover (the
+        nodes; all of a uniform variable; ``within`` of a normal one): by interval arithmetic. None
         for a system written in Python, which cannot be enclosed.
     samples, kept
         Random states of A, and how many of them are mapped into A by every noise node. Fewer where
@@ -102,6 +103,7 @@ class _Loop:
     def __init__(self, problem: Problem, local: LocalController, deadline: Deadline) -> None:
         self.local, self.partition = local, local.partition
         self.true_map, self.nodes = TrueMap(problem, local.partition), noise_nodes(problem).values
+        self.parts = noise_parts(problem)
         self.guard = partial(deadline.raise_if_over, DOING)
 
 
@@ -144,7 +146,7 @@ def _proved(loop: _Loop, cells: Indices) -> int | None:
     """
     if loop.true_map.map.enclose is None:
         return None
-    per_box = float(loop.true_map.map.effort) * len(loop.nodes) * (1 + loop.partition.dimension)
+    per_box = float(loop.true_map.map.effort) * len(loop.parts[0]) * (1 + loop.partition.dimension)
     proved, work = 0, WORK
     for start in range(0, len(cells), CHUNK):
         some = cells[start : start + CHUNK]
@@ -174,9 +176,9 @@ def _kept(loop: _Loop, cells: Indices, limit: float) -> tuple[int, float]:
             break
         inside = np.ones(len(owner), dtype=np.bool_)
         with np.errstate(all="ignore"):
-            for node in loop.nodes:
+            for least, most in zip(*loop.parts, strict=True):
                 loop.guard()
-                images = _images(loop, cells[owner], low, high, node)
+                images = _images(loop, cells[owner], low, high, Interval(least, most))
                 inside &= _into(partition, loop.local.attractor, images)
         centre = low / 2 + high / 2
         lost[owner[~_stays(loop, centre, cells[owner])]] = True
@@ -192,7 +194,9 @@ def _kept(loop: _Loop, cells: Indices, limit: float) -> tuple[int, float]:
     return int((~lost).sum()), work
 
 
-def _images(loop: _Loop, cell: Indices, low: Floats, high: Floats, noise: Floats) -> list[Interval]:
+def _images(
+    loop: _Loop, cell: Indices, low: Floats, high: Floats, noise: Interval
+) -> list[Interval]:
     """Enclose T(x, C0(x), w) on boxes."""
     centre = Interval.point(low / 2 + high / 2)
     away = subtract(Interval(low, high), centre)
@@ -202,7 +206,7 @@ def _images(loop: _Loop, cell: Indices, low: Floats, high: Floats, noise: Floats
     return [enclosure(image, at, steps) for image, at in zip(images, middle, strict=True)]
 
 
-def _closed(loop: _Loop, cell: Indices, box: Interval, noise: Floats) -> tuple[Jet, ...]:
+def _closed(loop: _Loop, cell: Indices, box: Interval, noise: Interval) -> tuple[Jet, ...]:
     """Return jets of the closed loop, derivatives with respect to the states."""
     d = loop.partition.dimension
     x = [Jet.variable(Interval(box.low[:, i], box.high[:, i]), i, d) for i in range(d)]
@@ -210,7 +214,8 @@ def _closed(loop: _Loop, cell: Indices, box: Interval, noise: Floats) -> tuple[J
     def on_jets(operation: str, *operands: Any) -> Any:
         return apply(operation, [y if isinstance(y, Jet) else Jet.constant(y, d) for y in operands])
 
-    u, w = loop.local.law(x, cell, on_jets), [Jet.constant(value, d) for value in noise]
+    ends = zip(noise.low[:, None], noise.high[:, None], strict=True)
+    u, w = loop.local.law(x, cell, on_jets), [Jet.held(Interval(*end), d) for end in ends]
     images = loop.true_map.enclose(x, u, w, loop.guard)
     assert images is not None
     return images

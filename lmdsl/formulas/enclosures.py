@@ -51,6 +51,12 @@ class Jet:
         return Jet(value, Interval.point(zero), 0.0)
 
     @staticmethod
+    def held(value: Interval, directions: int) -> Jet:
+        """Return a number of an interval, the same for all boxes; nothing is derived by it."""
+        zero = np.zeros((directions, *np.atleast_1d(value.low).shape))
+        return Jet(value, Interval.point(zero), 0.0)
+
+    @staticmethod
     def variable(value: Interval, k: int, directions: int) -> Jet:
         """Return the k-th of the variables with respect to which derivatives are taken."""
         slope = np.zeros((directions, *np.shape(value.low)))

@@ -102,6 +102,17 @@ def noise_nodes(problem: Problem) -> Nodes:
     return Nodes(values, weights, number[found])
 
 
+def noise_parts(problem: Problem) -> tuple[Floats, Floats]:
+    """Return the boxes of noise that enclosures cover: their ends, shapes (q, r)."""
+    memory.require(node_count(problem) * NODE, "noise nodes")
+    parts = [noise.parts() for noise in (problem.noise or {}).values()]
+    if not parts:
+        return np.zeros((1, 0)), np.zeros((1, 0))
+    grids = (np.meshgrid(*ends, indexing="ij") for ends in zip(*parts, strict=True))
+    low, high = (np.stack(grid, axis=-1).reshape(-1, len(parts)) for grid in grids)
+    return low, high
+
+
 def node_count(problem: Problem) -> int:
     """Return an upper bound of the number of noise nodes without making them."""
     return math.prod(noise.count() for noise in (problem.noise or {}).values())

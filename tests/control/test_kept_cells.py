@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from local_controllers import ORBIT, linear_system, local_of
 from problems import doubling, made, standard_map
 
+import lmdsl as lm
 from lmdsl.control.invariance import examine
 from lmdsl.formulas.enclosures import Jet, apply
 from lmdsl.formulas.intervals import Interval
@@ -252,3 +253,33 @@ def test_the_law_is_enclosed_as_it_is_computed():
         u = local(x, cells[owner])[:, 0]
         assert ((u >= law.value.low) & (u <= law.value.high)).all()
     assert box.low.shape == (len(cells) + 2, 2)  # two of the cells lie at the seam
+
+
+def test_all_of_the_declared_noise_is_enclosed():
+    """x+ = x/2 + w on A = [-1, 1], 20 cells: kept while |w| <= 1 - |x|/2, nodes or not."""
+
+    def kept(noise):
+        problem = made({
+            "format": "lmdsl/1",
+            "system": {"kind": "map", "next": {"x": "0.5*x + w + 0*u"}},
+            "state_box": {"x": {"low": -2, "high": 2, "cells": 40}},
+            "attractor": {"boxes": [{"x": [-1, 1]}]},
+            "control_grid": {"u": {"values": [0]}},
+            "noise": {"w": noise},
+            "stage_cost": "1",
+            "sampling": {"kind": "grid", "per_axis": 1},
+            "local_controller": {"kind": "constant", "control": {"u": 0}},
+        })  # fmt: skip
+        found = lm.solve(problem).local_controller
+        return found.proved, found.kept == found.samples
+
+    assert kept({"uniform": {"low": -0.49, "high": 0.49, "points": 1}}) == (20, True)
+    # The only node is 0, and keeps all; the ends keep cells with |x| < 0.6 alone: 12 of them.
+    assert kept({"uniform": {"low": -0.69, "high": 0.69, "points": 1}}) == (12, True)
+    assert kept({"uniform": {"low": -0.69, "high": 0.69, "points": 8}})[0] == 12
+    assert kept({"normal": {"std": 0.23, "points": 1}}) == (20, True)
+    assert kept({"normal": {"std": 0.23, "points": 1, "within": 2.0}}) == (20, True)
+    assert kept({"normal": {"std": 0.23, "points": 1, "within": 3.0}}) == (12, True)
+    assert kept({"normal": {"std": 0.23, "points": 3, "within": 3.0}})[0] == 12
+    wide = kept({"normal": {"std": 0.4, "points": 3, "within": 0.1}})  # nodes at 0.69 count still
+    assert wide[0] == 12
