@@ -1,4 +1,4 @@
-"""Tables of Gymnasium's environments, made without it, and value iteration by hand."""
+"""Tables of Gymnasium's environments, made without it, a file of Storm, and value iteration."""
 
 from __future__ import annotations
 
@@ -13,6 +13,35 @@ LAKES = {
 TAXI = ["+---------+", "|R: | : :G|", "| : | : : |", "| : : : : |", "| | : | : |", "|Y| : |B: |",
         "+---------+"]  # fmt: skip
 PLACES = [(0, 0), (0, 4), (4, 0), (4, 3)]
+
+
+STORM = """// Exported by storm
+// Original model type: MDP
+@type: MDP
+@parameters
+
+@reward_models
+steps energy
+@nr_states
+3
+@nr_choices
+4
+@model
+state 0 [0, 1] init
+//[x=0]
+\taction go [1, 0.5]
+\t\t1 : 0.3
+\t\t2 : 0.7
+\taction wait [1, 0]
+\t\t0 : 1
+state 1 "far off"
+\taction go [1, 2]
+\t\t0 : 0.3333333333
+\t\t2 : 0.6666666667
+state 2 done
+\taction __NOLABEL__ [0, 0]
+\t\t2 : 1
+"""
 
 
 def frozen_lake(name="4x4", slippery=True):

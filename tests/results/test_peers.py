@@ -10,7 +10,7 @@ import pytest
 from certificate_files import checked, exported
 from problems import doubling, made, steps
 from scipy.sparse import csr_array
-from tables import frozen_lake, taxi, value_iteration
+from tables import STORM, frozen_lake, taxi, value_iteration
 
 import lmdsl as lm
 from lmdsl.results.exports import export_drn
@@ -224,35 +224,6 @@ def row(lp, k):
     for j, c in lp.rows.exact(k):
         found[j] = found.get(j, Fraction(0)) + Fraction(c, lp.rows.total(k))
     return found
-
-
-STORM = """// Exported by storm
-// Original model type: MDP
-@type: MDP
-@parameters
-
-@reward_models
-steps energy
-@nr_states
-3
-@nr_choices
-4
-@model
-state 0 [0, 1] init
-//[x=0]
-\taction go [1, 0.5]
-\t\t1 : 0.3
-\t\t2 : 0.7
-\taction wait [1, 0]
-\t\t0 : 1
-state 1 "far off"
-\taction go [1, 2]
-\t\t0 : 0.3333333333
-\t\t2 : 0.6666666667
-state 2 done
-\taction __NOLABEL__ [0, 0]
-\t\t2 : 1
-"""
 
 
 def test_a_file_of_storm(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 
 from lmdsl.common.types import Floats
 from lmdsl.errors import BadInput
-from lmdsl.systems.matrices.layouts import coordinates, is_sparse, numbers
+from lmdsl.systems.matrices.layouts import coordinates, doubles, is_sparse, shape_of
 from lmdsl.systems.matrices.listing import Listing
 
 
@@ -20,7 +20,7 @@ def with_cost(listing: Listing, cost: Any, layout: str) -> Listing:
     listing = replace(listing, value=None, of_pair=None)
     if _of_transitions(cost, listing, layout):
         return replace(listing, value=_by_transition(cost, listing, layout))
-    array = np.asarray(numbers(_plain(cost), "cost"), dtype=np.float64)
+    array = doubles(_plain(cost), "cost")
     S, A, K = listing.states, listing.actions, len(listing.state)
     by_shape = {(S, A): lambda: array[listing.state, listing.action], (K,): lambda: array}
     if array.shape == (S,) == (K,) and not (listing.state == np.arange(S)).all():
@@ -44,16 +44,16 @@ def _of_transitions(cost: Any, listing: Listing, layout: str) -> bool:
     S, A, K = listing.states, listing.actions, len(listing.state)
     if isinstance(cost, list | tuple) and any(map(is_sparse, cost)):
         return True
-    shape = cost.shape if is_sparse(cost) else np.shape(cost)
+    shape = shape_of(cost)
     wanted = {"states": (A, S, S), "product": (S, A, S), "pairs": (K, S)}.get(layout)
-    return tuple(shape) == wanted and wanted != (S, A)
+    return shape == wanted and wanted != (S, A)
 
 
 def _by_transition(cost: Any, listing: Listing, layout: str) -> Floats:
     S, A = listing.states, listing.actions
     state, action = listing.state[listing.pair], listing.action[listing.pair]
     if layout == "product":
-        table = np.asarray(numbers(cost, "cost"), dtype=np.float64)
+        table = doubles(cost, "cost")
         return np.asarray(table[state, action, listing.target])
     if layout == "pairs":
         return _looked_up(cost, listing.pair, listing.target)
@@ -62,21 +62,21 @@ def _by_transition(cost: Any, listing: Listing, layout: str) -> Floats:
     found = np.empty(len(state))
     for a in range(A):
         of = np.flatnonzero(action == a)
-        if np.shape(cost[a]) != (S, S):
-            raise BadInput(f"the matrix of action {a} has shape {np.shape(cost[a])}", "cost")
+        if shape_of(cost[a]) != (S, S):
+            raise BadInput(f"the matrix of action {a} has shape {shape_of(cost[a])}", "cost")
         found[of] = _looked_up(cost[a], state[of], listing.target[of])
     return found
 
 
 def _looked_up(matrix: Any, row: Any, column: Any) -> Floats:
     if not is_sparse(matrix):
-        return np.asarray(np.asarray(numbers(matrix, "cost"), dtype=np.float64)[row, column])
+        return np.asarray(doubles(matrix, "cost")[row, column])
     (_, S), r, c, values = coordinates(matrix, "cost")
     key, wanted = r * S + c, row * S + column
     if not len(key):
         return np.zeros(len(wanted))
     at = np.minimum(np.searchsorted(key, wanted), len(key) - 1)
-    return np.where(key[at] == wanted, values[at].astype(np.float64), 0.0)
+    return np.where(key[at] == wanted, doubles(values, "cost")[at], 0.0)
 
 
 def paid(listing: Listing, maximise: bool) -> tuple[Floats, float | None, Listing]:
@@ -121,7 +121,7 @@ def _mean(listing: Listing) -> Floats:
     if listing.value is None:
         of_pair = np.zeros(K) if listing.of_pair is None else listing.of_pair
         return np.asarray(of_pair, dtype=np.float64)
-    share = listing.share.astype(np.float64)
+    share = doubles(listing.share, "P")
     with np.errstate(invalid="ignore", over="ignore"):
         total = np.bincount(listing.pair, share * listing.value, minlength=K)
         weight = np.bincount(listing.pair, share, minlength=K)

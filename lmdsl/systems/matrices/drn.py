@@ -17,6 +17,7 @@ import numpy as np
 from lmdsl.common.files import open_regular, reason
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
+from lmdsl.systems.matrices.layouts import doubles
 from lmdsl.systems.matrices.listing import Listing, fill
 
 NUMBER = re.compile(r"[+-]?\d{1,400}(\.\d{0,400})?([eE][+-]?\d{1,3})?(/\d{1,400})?")
@@ -66,7 +67,7 @@ def read_drn(path: str | os.PathLike[str], reward: str | None) -> tuple[Listing,
         pair=np.array(found.pair, dtype=np.int64),
         target=np.array(found.target, dtype=np.int64),
         share=fill(len(found.share), lambda x: x, found.share),
-        of_pair=np.array([float(x) for x in found.cost]),
+        of_pair=doubles(fill(len(found.cost), lambda x: x, found.cost), "cost"),
         decimal=found.decimal,
     ), found
 
@@ -134,7 +135,7 @@ def _read_states(lines: Numbered, found: Explicit, place: int | None) -> None:
             found.state.append(found.states - 1)
             found.name.append(words[1])
             found.cost.append(own + paid)
-        elif len(words) == 3 and words[1] == ":" and found.state and words[0].isdecimal():
+        elif len(words) == 3 and words[1] == ":" and found.state:
             found.pair.append(len(found.state) - 1)
             found.target.append(_whole(words[0], number))
             found.share.append(_number(words[2], number))
@@ -164,18 +165,23 @@ def _actions(found: Explicit) -> list[int]:
     """Return the number of every action."""
     alone = np.bincount(found.state)[found.state] == 1
     names = zip(found.name, alone.tolist(), strict=True)
-    numbered = all(only or (len(name) < 9 and name.isdecimal()) for name, only in names)
+    numbered = all(only or (_is_number(name)) for name, only in names)
     action, last, place = [], -1, 0
     for state, name in zip(found.state, found.name, strict=True):
         place = place + 1 if state == last else 0
         last = state
-        by_name = numbered and len(name) < 9 and name.isdecimal()
+        by_name = numbered and _is_number(name)
         action.append(int(name) if by_name else place)
     return action
 
 
+def _is_number(name: str) -> bool:
+    """Return whether an action is named by a number that can be its index."""
+    return len(name) < 7 and name.isascii() and name.isdecimal()
+
+
 def _whole(text: str, number: int) -> int:
-    if len(text) > 10:
+    if len(text) > 10 or not (text.isascii() and text.isdecimal()):
         raise _fault(number, f"there is no state {shown(text)}")
     return int(text)
 

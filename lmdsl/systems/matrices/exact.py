@@ -116,6 +116,8 @@ def _off(
 
 
 def _shown(x: Fraction) -> str:
+    if x > 10**300:
+        return "more than 1e300"
     return str(x) if x.denominator < 1000 else repr(float(x))
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common import inputs
-from lmdsl.common.types import Indices
+from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.systems.matrices.listing import MOST, Listing, fill
@@ -50,7 +50,7 @@ def layout_of(P: Any, layout: Any) -> str:
         return "pairs"
     if isinstance(P, list | tuple) and any(map(is_sparse, P)):
         return "states"
-    shape = np.shape(dense(P))
+    shape = shape_of(dense(P))
     if len(shape) == 2:
         return "pairs"
     fits = {"states": shape[1:2] == shape[2:3], "product": shape[:1] == shape[2:3]}
@@ -104,6 +104,8 @@ def read_gymnasium(P: Any) -> Listing:
         for a, transitions in _items(actions):
             state.append(inputs.whole(s, "P", 0))
             action.append(inputs.whole(a, "P", 0))
+            if not isinstance(transitions, list | tuple):
+                raise BadInput(f"P[{s}][{a}] is {shown(transitions)}, no list of transitions", "P")
             for entry in transitions:
                 try:
                     probability, after, reward, terminated = entry
@@ -130,7 +132,7 @@ def read_gymnasium(P: Any) -> Listing:
         pair=np.array(pair, dtype=np.int64),
         target=np.array(target, dtype=np.int64),
         share=numbers(fill(len(share), lambda x: x, share), "P"),
-        value=np.asarray(numbers(value, "P"), dtype=np.float64),
+        value=doubles(fill(len(value), lambda x: x, value), "P"),
         ends=np.array(ends, dtype=np.bool_),
     )
 
@@ -192,8 +194,8 @@ def _is_triple(P: Any) -> bool:
         isinstance(P, tuple | list)
         and len(P) == 3
         and not any(map(is_sparse, P[1:]))
-        and np.ndim(P[1]) == 1 == np.ndim(P[2])
-        and (is_sparse(P[0]) or np.ndim(P[0]) == 2)
+        and len(shape_of(P[1])) == 1 == len(shape_of(P[2]))
+        and len(shape_of(P[0])) == 2
     )
 
 
@@ -203,6 +205,14 @@ def _is_triple(P: Any) -> bool:
 def is_sparse(x: Any) -> bool:
     """Return whether this is a sparse matrix or array."""
     return hasattr(x, "tocoo") and hasattr(x, "shape")
+
+
+def shape_of(x: Any) -> tuple[int, ...]:
+    """Return the shape of what may be an array; () of what is none."""
+    try:
+        return tuple(int(k) for k in np.shape(x))
+    except (ValueError, TypeError):  # ragged
+        return ()
 
 
 def dense(x: Any) -> Any:
@@ -226,7 +236,7 @@ def coordinates(x: Any, where: str) -> tuple[tuple[int, int], Indices, Indices, 
             raise BadInput(f"holds an array of shape {matrix.shape} and no matrix", where)
         row, column = np.nonzero(matrix != 0)
         values = matrix[row, column]
-    K, S = (int(k) for k in np.shape(x))
+    K, S = shape_of(x)
     return (K, S), row.astype(np.int64), column.astype(np.int64), values
 
 
@@ -244,9 +254,17 @@ def numbers(x: Any, where: str) -> NDArray[Any]:
     if any(isinstance(v, float | np.floating) for v in flat):
         try:
             return array.astype(np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise BadInput(f"holds {shown(str(error))}; numbers are needed", where) from None
     return fill(len(flat), lambda v: exactly(v, where), flat).reshape(array.shape)
+
+
+def doubles(x: Any, where: str) -> Floats:
+    """Return numbers as doubles."""
+    try:
+        return np.asarray(numbers(x, where), dtype=np.float64)
+    except OverflowError:
+        raise BadInput("holds a number beyond the range of doubles", where) from None
 
 
 def exactly(value: Any, where: str) -> Fraction:
@@ -266,7 +284,7 @@ def exactly(value: Any, where: str) -> Fraction:
 
 def _alike(parts: list[NDArray[Any]]) -> NDArray[Any]:
     if any(part.dtype == np.float64 for part in parts):
-        parts = [part.astype(np.float64) for part in parts]
+        parts = [doubles(part, "P") for part in parts]
     return np.concatenate(parts)
 
 
