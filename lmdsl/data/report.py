@@ -8,7 +8,7 @@ import numpy as np
 from lmdsl.certificate import sums
 from lmdsl.common.records import Reported
 from lmdsl.common.types import Guard, Policy
-from lmdsl.data.intervals import Family, intervals, observed, unseen
+from lmdsl.data.intervals import ROUNDING, Family, intervals, observed, unseen
 from lmdsl.data.worst_case import Bounds, bounds
 from lmdsl.machine.deadline import TimeLimitReached
 from lmdsl.model.lp import StabilizationLP
@@ -45,6 +45,9 @@ class DataReport(Reported):
     cost
         The policy's cost by m lies between these for every chain whose probabilities lie in the
         intervals; None where no confidence was asked for. An upper end that is None is not bounded.
+    unseen_in_a_run
+        Upper limit of the probability that a run, started by m, meets what was not recorded before
+        it reaches A: it does not assume `support`. None where no confidence was asked for.
     """
 
     assumes: tuple[str, ...]
@@ -58,6 +61,7 @@ class DataReport(Reported):
     level: float
     unseen: tuple[float, float] | None
     cost: Range | None
+    unseen_in_a_run: float | None = None
 
     @classmethod
     def of(cls, lp: StabilizationLP, policy: Policy | None, guard: Guard | None = None) -> Self:
@@ -69,15 +73,18 @@ class DataReport(Reported):
         level = UNSEEN_LEVEL if system.confidence is None else system.confidence
         hidden: tuple[float, float] | None = None
         cost: Range | None = None
+        met: float | None = None
         if policy is not None and lp.n:
             seen, family = observed(lp, policy), Family.of(lp)
             limit = unseen(seen, family, level)
             hidden = (float(limit.max()), float(np.median(limit)))
             if system.confidence is not None:
                 cost = _range(lp, policy_bounds(lp, policy, system.confidence, guard))
+                met = _met(lp, policy, system.confidence, guard)
         return cls(
             ASSUMES, recorded.transitions, recorded.used, recorded.outside, recorded.unmatched,
             recorded.few, len(np.unique(rows.cell[free])), int(free.sum()), level, hidden, cost,
+            met,
         )  # fmt: skip
 
     def sentence(self) -> str:
@@ -114,6 +121,9 @@ class DataReport(Reported):
             low, high = (None if x is None else f"{x:.9g}" for x in self.cost)
             upto = "and not bounded above" if high is None else f"to {high}"
             lines.append(("true cost", f"{low} {upto} at {_percent(self.level)}, given `support`"))
+        if self.unseen_in_a_run is not None:
+            about = f"a run meets it with probability at most {self.unseen_in_a_run:.2g}"
+            lines[-2] = ("unseen", f"{lines[-2][1]}; {about}")
         return lines
 
     def text(self) -> str:
@@ -135,6 +145,22 @@ def policy_bounds(
         return bounds(rows, lp.cost[policy], lp.gamma * b, lp.growth * b, guard)
     except TimeLimitReached:
         return Bounds(np.zeros(lp.n), np.full(lp.n, np.inf))
+
+
+def _met(lp: StabilizationLP, policy: Policy, level: float, guard: Guard | None) -> float:
+    """Return an upper limit of the probability that a run meets what was not recorded.
+
+    It is at most V >= eps + max over rows of P V, eps the unseen mass of a cell, if intervals and
+    masses hold together: each at half of what may go wrong.
+    """
+    b = 1.0 if lp.problem.discount is None else lp.problem.discount
+    both, seen, family = (1.0 + level) / 2.0, observed(lp, policy), Family.of(lp)
+    eps = np.nextafter(unseen(seen, family, both) * (1 + ROUNDING), 2.0)
+    try:
+        V = bounds(intervals(seen, family, both), eps, b, b, guard).high
+    except TimeLimitReached:
+        return 1.0
+    return float(min(sums.mean(lp.weight, V, np.inf), 1.0))
 
 
 def _range(lp: StabilizationLP, found: Bounds) -> Range:

@@ -35,8 +35,8 @@ from lmdsl.results.directory.audit import (
     differences,
     function_differences,
     local_differences,
-    policy_of,
 )
+from lmdsl.results.directory.recorded import policy_of
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.systems import MatrixSystem

@@ -290,3 +290,42 @@ def test_the_family_is_fixed_beforehand():
             lp = lm.compile(chain(P4, counts, 0.9, seed=seed))
             sizes.add(Family.of(lp))
     assert sizes == {Family(3, 5)}
+
+
+def test_a_run_meets_what_was_not_recorded_as_rarely_as_is_said():
+    """Rare transitions: the probability of one that was not recorded, by the true chain."""
+    P = P4.copy()
+    P[1:, 2] -= 0.004
+    P[1, 3] += 0.004  # recorded in some data sets, not in others
+    P[2:, 1] += 0.004
+    level, kept, some = 0.8, 0, 0
+    for seed in range(60):
+        result = lm.solve(chain(P, 150, level, seed=seed))
+        lp, limit = result.lp, result.data.unseen_in_a_run
+        seen = observed(lp, np.arange(lp.K))
+        on = np.zeros((3, 4), dtype=bool)
+        on[seen.owner, seen.target] = True  # the last is A
+        rows = P[1:, [1, 2, 3, 0]]
+        met = np.linalg.solve(
+            np.eye(3) - np.where(on, rows, 0)[:, :3], np.where(on, 0, rows).sum(1)
+        )
+        kept += met.mean() <= limit
+        some += met.mean() > 0
+    assert kept >= level * 60
+    assert 0 < some < 60
+
+
+def test_what_a_run_may_meet_in_closed_form():
+    """One free cell, always left for A: what was not seen in one step."""
+    problem = lm.from_data(
+        [1.0] * 200, None, [0] * 200, confidence=0.9, control_grid={}, stage_cost="1",
+        state_box={"x": {"low": -0.5, "high": 1.5, "cells": 2}}, attractor={"cells": [[0]]},
+    )  # fmt: skip
+    data = lm.solve(problem).data
+    eps = 1 - (0.05 / 1 / 3 / 3) ** (1 / 200)  # half of what may go wrong; 3 sets of one outcome
+    assert data.unseen_in_a_run == pytest.approx(eps, rel=1e-6)
+    assert "a run meets it with probability at most" in str(data)
+    assert (
+        lm.solve(problem.replaced(system=problem.system.replaced(confidence=None))).data.cost
+        is None
+    )

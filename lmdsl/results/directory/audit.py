@@ -1,7 +1,6 @@
 """What a certificate.json says, compared with what was found anew: every number that is a claim."""
 
 import math
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -10,9 +9,8 @@ from lmdsl.certificate.checks import MEASURE_TOLERANCE
 from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
 from lmdsl.common.records import jsonable
-from lmdsl.common.types import Floats, Policy
+from lmdsl.common.types import Floats
 from lmdsl.control.invariance import SAMPLES, LocalCheck, examine
-from lmdsl.data.report import DataReport
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.sampler import Sampler
 from lmdsl.model.local.controller import LocalController
@@ -21,9 +19,10 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.optimize.feasibility import gamma_bar
 from lmdsl.results.directory.archive import identity
 from lmdsl.results.directory.certificate_file import CertificateFile, scope
+from lmdsl.results.directory.recorded import data_differences
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
-from lmdsl.systems import DataSystem, FunctionSystem
+from lmdsl.systems import FunctionSystem
 
 _WEAKER = {"cost": 1e-9, "lower_bound": 1e-9, "gap": 1e-3, "contraction": 1e-9}
 # By how much, relative, a stored number may be weaker than the one proved anew; by how much,
@@ -61,54 +60,8 @@ def differences(
         reasons.append("beyond_gamma is not the cells that solution.npz names")
     if certificate.scope != scope(result.problem):
         reasons.append("scope is not what verified speaks of")
-    reasons += _data(lp, result)
+    reasons += data_differences(lp, result)
     return reasons + _bracket(whole, result, found)
-
-
-def policy_of(lp: StabilizationLP, result: Result) -> Policy | None:
-    """Return the columns of the stored controls, None where one is no surviving pair."""
-    wanted = result.control_index[lp.cells]
-    M = len(lp.controls)
-    key = lp.cell.astype(np.int64) * M + lp.control
-    target = np.arange(lp.n, dtype=np.int64) * M + wanted
-    policy = np.minimum(np.searchsorted(key, target), max(lp.K - 1, 0))
-    if not lp.K or (wanted < 0).any() or (key[policy] != target).any():
-        return None
-    return policy
-
-
-def _data(lp: StabilizationLP, result: Result) -> list[str]:
-    """Report on the data again, and compare every figure."""
-    stored, found = result.data, None
-    if isinstance(result.problem.system, DataSystem):
-        found = DataReport.of(lp, policy_of(lp, result))
-    if stored is None or found is None:
-        return [] if stored is found else [_differs("data", stored, found)]
-    return [
-        _differs(f"data.{field.name}", ours, theirs)
-        for field in fields(DataReport)
-        if not (_wider if field.name == "cost" else _alike)(
-            ours := getattr(stored, field.name), theirs := getattr(found, field.name)
-        )
-    ]
-
-
-def _wider(stored: Any, found: Any) -> bool:
-    """Return whether a stored range says no more than the one found."""
-    if stored is None or found is None:
-        return stored is found
-    (low, high), (least, most) = stored, found
-    lower = low is not None and low <= least * (1 + 1e-9)
-    return lower and (high is None or (most is not None and high >= most * (1 - 1e-9)))
-
-
-def _alike(a: Any, b: Any) -> bool:
-    """Return whether two figures, or two of each, are the same but for rounding."""
-    if isinstance(a, tuple) and isinstance(b, tuple):
-        return len(a) == len(b) and all(map(_alike, a, b))
-    if isinstance(a, float) and isinstance(b, float):
-        return math.isclose(a, b, rel_tol=1e-9)
-    return bool(a == b)
 
 
 def _differs(name: str, stored: Any, found: Any) -> str:
