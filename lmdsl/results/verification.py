@@ -83,7 +83,6 @@ class Verification:
         lines += [f"  {printable(sentence)}" for sentence in (*self.reasons, *self.notes)]
         if proof.assumes:
             lines.append(f"  assumed: {proof.assumes}")
-            return "\n".join([*lines, "  (claims speak of the finite model of the recorded data)"])
         return "\n".join([*lines, f"  (claims speak of {self.scope})"])
 
     __str__ = text

@@ -1,11 +1,14 @@
 """What is said of recorded data beside the result: explanations, exports, limits, edges."""
 
+import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from saved_results import put
 
 import lmdsl as lm
 from lmdsl.cli import main
@@ -129,3 +132,63 @@ def test_simulated_runs_pay_what_was_recorded():
     assert runs.reached == 4000
     assert abs(runs.cost["mean"] - result.cost) < 5 * runs.cost["standard_error"]
     assert runs.method == "recorded rows"
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """A saved result of noisy data, its files' content, and the arrays of its rows."""
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(0, 2, 3000), rng.integers(0, 2, 3000)
+    noisy = lm.from_data(x, u, 0.7 * x + rng.uniform(-0.1, 0.2, 3000).clip(-0.7 * x), **KEYS,
+                         confidence=0.9)  # fmt: skip
+    result = lm.solve(noisy)
+    assert result.verified
+    place = tmp_path_factory.mktemp("saved") / "out"
+    result.save(place)
+    assert lm.verify(place).holds
+    return place
+
+
+def spoiled(saved, tmp_path):
+    return Path(shutil.copytree(saved, tmp_path / "copy"))
+
+
+@pytest.mark.parametrize("number", range(13))
+def test_every_figure_of_the_report_is_checked(saved, tmp_path, number):
+    target = spoiled(saved, tmp_path)
+    certificate = json.loads((target / "certificate.json").read_text())
+    data = certificate["data"]
+    figures = [(key, None) for key in data if isinstance(data[key], int | float)]
+    figures += [(key, k) for key in ("unseen", "cost") for k in (0, 1)]
+    key, k = figures[number]
+    better = 1.01 if (key, k) == ("cost", 0) else 0.99
+    if k is None:
+        data[key] = data[key] + 1 if isinstance(data[key], int) else data[key] * better
+    else:
+        data[key][k] *= better
+    put(target, certificate)
+    assert f"data.{key}" in str(lm.verify(target).reasons)
+    assert len(figures) == 13
+
+
+@pytest.mark.parametrize("place", [-3, -2, -1])  # of cells that are not attractor
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("cell", 1), ("control", 1), ("cost", -0.3), ("cost", np.nan), ("cost", 0.3),
+        ("pointer", 1), ("target", 1), ("target", -9), ("code", 1), ("code", 10**6),
+        ("numerator", 1), ("denominator", 1),
+    ],
+)  # fmt: skip
+def test_spoiled_rows_are_refused(saved, tmp_path, name, change, place):
+    target = spoiled(saved, tmp_path)
+    with np.load(target / "model.npz", allow_pickle=False) as stored:
+        arrays = {key: stored[key] for key in stored.files}
+    flat = arrays[name].reshape(-1)
+    flat[place] = flat[place] + change if name == "cost" else (int(flat[place]) + change) % 2**31
+    put(target, model=arrays)
+    try:
+        found = lm.verify(target)
+    except lm.BadInput:
+        return
+    assert not (found.holds and found.same_model)

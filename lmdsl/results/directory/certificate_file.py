@@ -24,9 +24,7 @@ from lmdsl.systems import System
 def scope(problem: Problem) -> str:
     """Return of what the claims speak, and what they assume."""
     system = problem.system
-    if not system.assumes:
-        return system.scope
-    return f"the finite model of the recorded data; assumed: {system.assumes}"
+    return f"{system.scope}; assumed: {system.assumes}" if system.assumes else system.scope
 
 
 T = TypeVar("T")

@@ -51,6 +51,7 @@ class DataSystem(MatrixSystem):
         What is added to the count of every recorded successor of a pair.
     """
 
+    scope: ClassVar[str] = "the finite model of the recorded data"
     assumes: ClassVar[str] = (
         "no transition occurs that was not recorded (assumption `support`), and those recorded are "
         "independent draws in their cells (assumption `independence`)"
