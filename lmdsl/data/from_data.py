@@ -199,7 +199,11 @@ def _named(table: Any, names: tuple[str, ...]) -> Floats:
 
 def _array(values: Any, names: tuple[str, ...], where: str) -> Floats:
     """Return an array of shape (T, names); of one name also from shape (T,)."""
-    if len(names) == 1 and not hasattr(values, "keys"):
+    column = (
+        getattr(values, "ndim", 0) == 1
+        and getattr(getattr(values, "dtype", None), "names", None) is None
+    )
+    if len(names) == 1 and (column or not hasattr(values, "keys")):
         plain = inputs.real(values, where)
         if plain.ndim == 1:
             return plain[:, None]

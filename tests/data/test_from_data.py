@@ -242,3 +242,40 @@ def test_a_spoiled_report_is_not_confirmed(tmp_path, file, old, new, reason):
     found = lm.verify(tmp_path / "out")
     assert not found.holds
     assert any(reason in each for each in found.reasons), found
+
+
+class Column:
+    """As a series of pandas: one-dimensional, and yet with keys."""
+
+    ndim, dtype = 1, np.dtype(float)
+
+    def __init__(self, values):
+        self.values = values
+
+    def keys(self):
+        return range(len(self.values))
+
+    def __array__(self, dtype=None, copy=None):
+        return np.array(self.values, dtype=float)
+
+
+def test_a_column_of_a_table_is_an_array():
+    columns = [Column(values) for values in ([0.6, 1.2], [0, 1], [0.1, 0.3])]
+    assert lm.from_data(*columns, **KEYS) == lm.from_data([0.6, 1.2], [0, 1], [0.1, 0.3], **KEYS)
+
+
+def test_tables_of_pandas():
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame({"u": [0, 1], "x_next": [0.1, 0.3], "x": [0.6, 1.2]})
+    expected = lm.from_data([0.6, 1.2], [0, 1], [0.1, 0.3], **KEYS)
+    assert lm.from_data(table, **KEYS) == expected
+    assert lm.from_data(table["x"], table["u"], table["x_next"], **KEYS) == expected
+    assert lm.from_data(table[["x"]], table[["u"]], table["x_next"], **KEYS) == expected
+
+
+def test_no_file_declares_data():
+    with pytest.raises(lm.BadInput, match="kind 'data' cannot be declared in a file"):
+        lm.Problem(system={"kind": "data"}, sampling={"kind": "grid", "per_axis": 1}, **KEYS)
+    problem = lm.from_data([0.6], [0], [0.1], **KEYS)
+    with pytest.raises(lm.BadInput, match="save the result"):
+        problem.to_json()

@@ -329,3 +329,30 @@ def test_what_a_run_may_meet_in_closed_form():
         lm.solve(problem.replaced(system=problem.system.replaced(confidence=None))).data.cost
         is None
     )
+
+
+def chosen_by_the_data(sets, level):
+    """Six controls that are all alike: the best of the data is the luckiest. Its true cost?"""
+    p, low_side, within = np.array([0.5, 0.3, 0.2]), 0, 0
+    truth = 1 / (1 - 0.5)  # from cell 1: stay 0.3, or 2; from 2 alike: leave with 0.5 in all
+    for seed in range(sets):
+        rng = np.random.default_rng(seed)
+        u = np.tile(np.arange(6), 2 * 40)
+        x = np.repeat([1, 2], 240)
+        y = rng.choice(3, size=480, p=p)
+        result = lm.solve(lm.from_data(
+            x.astype(float), u, y.astype(float), confidence=level, stage_cost="1",
+            state_box={"x": {"low": -0.5, "high": 2.5, "cells": 3}},
+            control_grid={"u": {"low": 0, "high": 5, "points": 6}}, attractor={"cells": [[0]]},
+        ))  # fmt: skip
+        low_side += result.cost < truth
+        low, high = result.data.cost
+        within += low <= truth <= high
+    return low_side / sets, within / sets
+
+
+def test_a_policy_chosen_by_the_data_is_covered_too():
+    """The recorded cost of the chosen policy is too good; its interval holds all the same."""
+    too_good, within = chosen_by_the_data(40, 0.8)
+    assert too_good > 0.9
+    assert within >= 0.8
