@@ -1,5 +1,7 @@
 """Cart and pole in four dimensions: catch the falling pole, keep the cart on its rail.
 
+Twelve cells an axis are few: nine of ten runs arrive, and both ways of asking say so.
+
 Run:  python cart_pole.py
 """
 
@@ -22,7 +24,7 @@ problem = lm.Problem(
             "rate": FALL,
         },
         "step": 0.1,
-        "substeps": 2,
+        "substeps": "auto",
     },
     state_box={
         "place": {"low": -2.4, "high": 2.4, "cells": 12},

@@ -19,7 +19,7 @@ problem = lm.Problem(
         "kind": "ode",
         "derivative": {"x": "cos(heading)", "y": "sin(heading)", "heading": "u"},
         "step": 0.5,
-        "substeps": 2,
+        "substeps": "auto",
     },
     state_box={
         "x": {"low": 0, "high": 10, "cells": N},

@@ -15,7 +15,7 @@ problem = lm.Problem(
         "parameters": {"damping": 0.3},
         "derivative": {"x": "v", "v": "x - x**3 - damping*v + u"},
         "step": 0.3,
-        "substeps": 4,
+        "substeps": "auto",
     },
     state_box={
         "x": {"low": -2, "high": 2, "cells": 64},

@@ -18,7 +18,7 @@ problem = lm.Problem(
             "ill": "contact*(1 - distance)*well*ill - recovery*ill",
         },
         "step": 4,
-        "substeps": 4,
+        "substeps": "auto",
     },
     state_box={
         "well": {"low": 0, "high": 1, "cells": 100},
