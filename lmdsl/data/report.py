@@ -9,7 +9,7 @@ from lmdsl.certificate import sums
 from lmdsl.common.records import Reported
 from lmdsl.common.types import Guard, Policy
 from lmdsl.data.intervals import ROUNDING, Family, intervals, observed, unseen
-from lmdsl.data.worst_case import Bounds, bounds
+from lmdsl.data.worst_case import Bounds, bounds, of_one_chain
 from lmdsl.machine.deadline import TimeLimitReached
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
@@ -156,8 +156,12 @@ def _met(lp: StabilizationLP, policy: Policy, level: float, guard: Guard | None)
     b = 1.0 if lp.problem.discount is None else lp.problem.discount
     both, seen, family = (1.0 + level) / 2.0, observed(lp, policy), Family.of(lp)
     eps = np.nextafter(unseen(seen, family, both) * (1 + ROUNDING), 2.0)
+    rows = intervals(seen, family, both)
+    one = of_one_chain(rows, eps, b)
+    if one is None or lp.weight @ one >= 1.0 + ROUNDING:
+        return 1.0  # the worst is no less
     try:
-        V = bounds(intervals(seen, family, both), eps, b, b, guard).high
+        V = bounds(rows, eps, b, b, guard, below=False).high
     except TimeLimitReached:
         return 1.0
     return float(min(sums.mean(lp.weight, V, np.inf), 1.0))

@@ -16,7 +16,7 @@ from lmdsl.certificate.interval_checks import IntervalRows
 from lmdsl.certificate.sums import UNIT
 from lmdsl.common.types import Floats, Guard
 
-MOST_STEPS, CLOSE, TRIES = 200, 1e-13, 8
+MOST_STEPS, CLOSE, TRIES = 200, 1e-11, 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +36,12 @@ class Bounds:
 
 
 def bounds(
-    rows: IntervalRows, G: Floats, factor: float, growth: float, guard: Guard | None = None
+    rows: IntervalRows,
+    G: Floats,
+    factor: float,
+    growth: float,
+    guard: Guard | None = None,
+    below: bool = True,
 ) -> Bounds:
     """Return bounds of the cost of a policy.
 
@@ -50,6 +55,8 @@ def bounds(
         gamma and max(gamma, 1), each times the discount.
     guard
         Called now and then; it may raise.
+    below
+        Whether the lower bound is asked for; else it is 0.
     """
     n = rows.columns
     nothing = Bounds(np.zeros(n), np.full(n, np.inf))
@@ -65,9 +72,14 @@ def bounds(
     high = _lifted(rows, G, up, V, w, float(margin.min()))
     if high is None:
         return nothing
-    V = _value(rows, G, down, -1.0, guard)
+    V = _value(rows, G, down, -1.0, guard) if below else None
     low = None if V is None else _lowered(rows, G, down, V, w, float(margin.min()))
     return Bounds(np.zeros(n) if low is None else low, high)
+
+
+def of_one_chain(rows: IntervalRows, G: Floats, factor: float) -> Floats | None:
+    """Return about the cost of one chain, a bad one: the worst is no less. None: not finite."""
+    return _solved(rows, _extreme(rows, G, 1.0)[0], G, factor)
 
 
 def _padded(V: Floats) -> Floats:
