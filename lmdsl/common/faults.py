@@ -1,6 +1,7 @@
 """What pydantic finds wrong, as one line: every fault with its path, the value and the fix."""
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
 
@@ -10,8 +11,8 @@ from lmdsl.common import spelling
 from lmdsl.common.files import joined
 from lmdsl.errors import BadInput, shown
 
-# Number of characters of a message above which further faults are counted only.
-MOST_CHARACTERS = 900
+# Number of faults above which further ones are counted only, and of characters of a message.
+MOST_FAULTS, MOST_CHARACTERS = 20, 6_000
 
 # What to do about each kind of fault that pydantic finds.
 _FIXES = {
@@ -43,9 +44,8 @@ class _Fault(NamedTuple):
     message: str
     meant: str | None = None
     """Path of the key that an unknown key was probably meant to be."""
-
-    def __str__(self) -> str:
-        return f"{self.where}: {self.message}" if self.where else self.message
+    known: str = ""
+    """The keys that are known there, to be said once."""
 
 
 def condensed(error: ValidationError, model: Any) -> BadInput:
@@ -53,13 +53,38 @@ def condensed(error: ValidationError, model: Any) -> BadInput:
     faults = [_fault(item, model) for item in error.errors(include_url=False)]
     meant = {fault.meant for fault in faults if fault.meant}
     faults = [fault for fault in faults if fault.where not in meant or fault.message != _ADD]
-    first, *others = sorted(faults, key=lambda fault: fault.meant is None)
+    faults.sort(key=lambda fault: fault.meant is None)
+    said: set[str] = set()
+    found = []
+    for fault in faults:
+        found.append(BadInput(fault.message + fault.known * (fault.known not in said), fault.where))
+        said.add(fault.known)
+    return together(found)
+
+
+def together(faults: Sequence[BadInput]) -> BadInput:
+    """Return faults, at least one, as one error: the first that each field has, 20 at most."""
+    first, *others = {(fault.where, fault.message): fault for fault in faults}.values()
+    if not others:
+        return first
     message = first.message
     for k, fault in enumerate(others):
-        if len(first.where) + len(message) + len(str(fault)) > MOST_CHARACTERS:
+        if k + 1 >= MOST_FAULTS or len(message) + len(str(fault)) > MOST_CHARACTERS:
             return BadInput(f"{message}; and {len(others) - k} more", first.where)
         message += f"; {fault}"
     return BadInput(message, first.where)
+
+
+def require_all(checks: Iterable[Callable[[], object]]) -> None:
+    """Make checks, and refuse what they find as one error that names every fault."""
+    faults = []
+    for check in checks:
+        try:
+            check()
+        except BadInput as error:
+            faults.append(error)
+    if faults:
+        raise together(faults)
 
 
 def _fault(item: Mapping[str, Any], model: type[BaseModel]) -> _Fault:
@@ -79,16 +104,28 @@ def _fault(item: Mapping[str, Any], model: type[BaseModel]) -> _Fault:
         fix = "names are strings"
     limits = {key: _plain(value) for key, value in item.get("ctx", {}).items()}
     fix = fix.format(**limits) if fix else item["msg"]
-    given = item["input"]
-    given = list(given) if isinstance(given, tuple) else given
-    return _Fault(where, f"{shown(given)} is not accepted; {fix}")
+    return _Fault(where, f"{written(item['input'])} is not accepted; {fix}")
+
+
+def written(value: Any, limit: int = 120) -> str:
+    """Return a value as JSON has it, short and on one line; what JSON has not, as Python has it."""
+    if isinstance(value, dict | list | tuple) and len(value) > 8:
+        kind = "an object of {} keys" if isinstance(value, dict) else "a list of {} entries"
+        return kind.format(len(value))
+    if isinstance(value, bool | dict | list | tuple) or value is None:
+        try:
+            text = json.dumps(value)
+        except (TypeError, ValueError, RecursionError):
+            return shown(value)
+        return text if len(text) <= limit else text[:limit] + "..."
+    return shown(value)
 
 
 def _kind(where: str, item: Mapping[str, Any]) -> _Fault:
     given, listed = item["input"], item["msg"]
     if not isinstance(given, Mapping):
         fix = f"write an object with a kind: {listed}"
-        return _Fault(where, f"{shown(given)} is not accepted; {fix}")
+        return _Fault(where, f"{written(given)} is not accepted; {fix}")
     if "kind" not in given:
         return _Fault(where, f"kind is missing; the kinds are {listed}")
     kind = given["kind"]
@@ -110,7 +147,7 @@ def _unknown(where: str, location: tuple[int | str, ...], model: type[BaseModel]
         near = spelling.nearest(str(location[-1]), other - {location[-1]}, spelling.KEYS)
     if near is None:
         known = f" (known keys: {', '.join(allowed)})" if allowed else ""
-        return _Fault(where, f"unknown key; remove it or correct its spelling{known}")
+        return _Fault(where, "unknown key; remove it or correct its spelling", None, known)
     return _Fault(where, f"unknown key; did you mean {near!r}?", _path((*location[:-1], near)))
 
 

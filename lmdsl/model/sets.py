@@ -9,15 +9,17 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common.faults import together
 from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.errors import BadInput
 from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
-from lmdsl.model.grid import conditions
+from lmdsl.model.grid import boxes, conditions
 from lmdsl.model.grid.axis import AxisCells
 from lmdsl.model.grid.partition import Partition
 from lmdsl.problem.problem import Problem
+from lmdsl.problem.sets import Attractor, Measure
 
 CELL = 32  # bytes of a cell while the sets are made
 
@@ -63,8 +65,8 @@ class CellSets:
         avoid = _avoid(problem, partition, guard)
         both = np.flatnonzero(attractor & avoid)
         if len(both):
-            index = [int(k) for k in np.unravel_index(both[0], partition.shape)]
-            raise BadInput(f"cell {index} is both attractor and avoid; shrink one of them", "avoid")
+            cell = boxes.named(partition, int(both[0]))
+            raise BadInput(f"{cell} is both attractor and avoid; shrink one of them", "avoid")
         mass = _mass(problem, partition, guard)
         free = np.flatnonzero(~attractor & ~avoid)
         number = np.full(partition.size, -1, dtype=np.int32)
@@ -82,11 +84,11 @@ def _conditions(problem: Problem, where: str, partition: Partition, guard: Guard
 
 
 def _avoid(problem: Problem, partition: Partition, guard: Guard) -> Bools:
-    boxes = (
+    blocks = (
         partition.overlapping_box(box, f"avoid.boxes[{i}]")
         for i, box in enumerate((problem.avoid and problem.avoid.boxes) or ())
     )
-    mask = partition.mask(boxes, guard)
+    mask = partition.mask(blocks, guard)
     for condition in problem.conditions("avoid"):
         mask |= conditions.possible(condition, problem.system.constants(), partition, guard)
     return mask
@@ -113,22 +115,20 @@ def _mass(problem: Problem, partition: Partition, guard: Guard) -> Floats:
             mass[some] = program(dict(zip(partition.names, centres.T, strict=True)), guard)[0]
         bad = np.flatnonzero(~((mass >= 0) & np.isfinite(mass)))
         if len(bad):
-            index = [int(k) for k in np.unravel_index(bad[0], partition.shape)]
+            cell = boxes.named(partition, int(bad[0]))
             raise BadInput(
-                f"the density is {float(mass[bad[0]])!r} in cell {index}; it must be finite "
-                "and >= 0",
+                f"the density is {float(mass[bad[0]])!r} in {cell}; it must be finite and >= 0",
                 "measure.density",
             )
     if declared.boxes is not None or declared.where is not None:
-        boxes = (
+        blocks = (
             partition.inside_box(box, f"measure.boxes[{i}]")
             for i, box in enumerate(declared.boxes or ())
         )
-        inside = partition.mask(boxes, guard)
+        inside = partition.mask(blocks, guard)
         inside |= _conditions(problem, "measure", partition, guard)
         if not inside.any():
-            key = "where" if declared.boxes is None else "boxes"
-            raise BadInput(_NO_CELL[key], f"measure.{key}")
+            raise _no_cell(declared, partition, "measure")
         mass[~inside] = 0.0
     if not mass.any():
         raise BadInput("no cell carries weight; widen the boxes or the density", "measure")
@@ -144,7 +144,7 @@ def _attractor(problem: Problem, partition: Partition, guard: Guard) -> Bools:
         )
         for i, point in enumerate(declared.points)
     )
-    boxes = (
+    blocks = (
         partition.inside_box(box, f"attractor.boxes[{i}]") for i, box in enumerate(declared.boxes)
     )
     cells = (tuple(np.array([index]) for index in cell) for cell in declared.cells)
@@ -156,18 +156,46 @@ def _attractor(problem: Problem, partition: Partition, guard: Guard) -> Bools:
                     f"{partition.names[k]}",
                     f"attractor.cells[{i}]",
                 )
-    mask = partition.mask(itertools.chain(points, boxes, cells), guard)  # one at a time
+    mask = partition.mask(itertools.chain(points, blocks, cells), guard)  # one at a time
     mask |= _conditions(problem, "attractor", partition, guard)
     if not (mask.any() or declared.empty):
-        key = "where" if declared.where and not declared.boxes else "boxes"
-        raise BadInput(f"{_NO_CELL[key]} or give points", "attractor")
+        raise _no_cell(declared, partition, "attractor")
     return mask
 
 
-_NO_CELL = {
-    "boxes": "no cell lies inside the boxes; enlarge them",
-    "where": "on no cell as a whole the condition certainly holds; widen it, use smaller cells",
-}
+def _no_cell(declared: Attractor | Measure, partition: Partition, where: str) -> BadInput:
+    """Return why a set that is declared by boxes and conditions has no cell, box by box."""
+    faults = []
+    for i, box in enumerate(declared.boxes or ()):
+        for name, block in zip(
+            partition.names, partition.inside_box(box, f"{where}.boxes[{i}]"), strict=True
+        ):
+            if not block:
+                why = _why_empty(partition, name, box[name])
+                faults.append(BadInput(why, f"{where}.boxes[{i}].{name}"))
+    if declared.where is not None:
+        why = "on no cell as a whole the condition certainly holds; widen it, or use smaller cells"
+        faults.append(BadInput(why, f"{where}.where"))
+    return together(faults)
+
+
+def _why_empty(partition: Partition, name: str, ends: tuple[float, float]) -> str:
+    """Return why an axis has no cell between two ends, and what to write."""
+    axis = partition.axes[partition.names.index(name)]
+    a, b = ends
+    told = f"[{a!r}, {b!r}]"
+    if b <= axis.low or a >= axis.high:
+        return (
+            f"{told} lies outside the axis, [{axis.low!r}, {axis.high!r}]; move it inside, or "
+            f"widen {name} in state_box"
+        )
+    first, last = (axis.low + k * axis.width for k in (
+        np.floor((a - axis.low) / axis.width), np.ceil((b - axis.low) / axis.width)))  # fmt: skip
+    first, last = max(first, axis.low) + 0.0, min(last, axis.high) + 0.0
+    return (
+        f"{told} holds no whole cell, which is {axis.width:.6g} wide; write [{first:.6g}, "
+        f"{last:.6g}], or use more cells"
+    )
 
 
 MOST_BOXES = 3  # boxes of which is said what became of them

@@ -1,10 +1,12 @@
 """The axes of the state box."""
 
 import math
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from lmdsl.common.faults import written
+from lmdsl.common.inputs import is_number
 from lmdsl.common.strict_model import Count, Declared, Number, frozen_dict, plain
 from lmdsl.errors import BadInput
 from lmdsl.formulas.names import named_keys, valid_names
@@ -43,8 +45,18 @@ class Axis(Declared):
         return self
 
 
+def _spelled_out(value: Any) -> Any:
+    """Refuse the two ends of an axis alone, and say how to write it."""
+    if isinstance(value, list | tuple) and len(value) == 2 and all(map(is_number, value)):
+        low, high = map(written, value)
+        raise BadInput(
+            f'{written(value)} is not an axis; write {{"low": {low}, "high": {high}, "cells": 50}}'
+        )
+    return value
+
+
 StateBox = Annotated[
-    dict[str, Axis],
+    dict[str, Annotated[Axis, BeforeValidator(_spelled_out)]],
     Field(min_length=1, max_length=MAX_AXES),
     BeforeValidator(plain),
     valid_names,

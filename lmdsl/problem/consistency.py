@@ -1,9 +1,11 @@
 """Whether the keys of a problem fit together: names, and what is counted by axis or by point."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from lmdsl.common import spelling
+from lmdsl.common.faults import require_all
 from lmdsl.errors import BadInput, shown
 from lmdsl.problem import endings
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
@@ -23,14 +25,28 @@ def require_writable(problem: "Problem") -> None:
 
 
 def require_consistent(problem: "Problem") -> None:
-    """Refuse a problem whose names stand twice or nowhere; its formulas are parsed elsewhere."""
-    _unique_names(problem)
-    endings.require_fit(problem)
-    endings.require_end(problem)
-    _one_cost(problem)
-    _sets_named(problem)
-    _local_named(problem)
-    problem.sampling.check(problem.states)
+    """Refuse a problem whose keys do not fit together; every fault is named."""
+    checks = (
+        _unique_names, endings.require_fit, endings.require_end, _one_cost, _sets_named,
+        _local_named,
+    )  # fmt: skip
+    require_all(
+        [
+            *(partial(check, problem) for check in checks),
+            partial(problem.sampling.check, problem.states),
+            *_formulas(problem),
+        ]
+    )
+
+
+def _formulas(problem: "Problem") -> Iterator[Callable[[], object]]:
+    """Yield what parses the formulas of a problem, those of ``let`` first."""
+    yield problem.definitions
+    yield problem.step
+    if problem.stage_cost is not None or problem.cost_rate is not None:
+        yield lambda: problem.stage() or problem.cost()
+    yield from (problem.terminal, problem.density, problem.admitted)
+    yield from (partial(problem.conditions, key) for key in ("attractor", "avoid", "measure"))
 
 
 def _unique_names(problem: "Problem") -> None:
@@ -66,14 +82,21 @@ def _one_cost(problem: "Problem") -> None:
 
 def _sets_named(problem: "Problem") -> None:
     states = problem.states
-    _points_named(problem.attractor.points, states, "attractor.points")
-    for i, cell in enumerate(problem.attractor.cells):
-        if len(cell) != len(states):
-            raise BadInput(f"{len(cell)} indices for {len(states)} axes", f"attractor.cells[{i}]")
+    checks: list[Callable[[], None]] = [
+        partial(_points_named, problem.attractor.points, states, "attractor.points"),
+        partial(_cells_named, problem.attractor.cells, states),
+    ]
     for where in ("attractor", "avoid", "measure"):
         part = getattr(problem, where)
         for i, box in enumerate((part.boxes or ()) if part else ()):
-            _box_named(box, states, f"{where}.boxes[{i}]")
+            checks.append(partial(_box_named, box, states, f"{where}.boxes[{i}]"))
+    require_all(checks)
+
+
+def _cells_named(cells: Any, states: tuple[str, ...]) -> None:
+    for i, cell in enumerate(cells):
+        if len(cell) != len(states):
+            raise BadInput(f"{len(cell)} indices for {len(states)} axes", f"attractor.cells[{i}]")
 
 
 def _points_named(points: Any, states: tuple[str, ...], where: str) -> None:

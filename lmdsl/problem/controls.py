@@ -1,11 +1,13 @@
 """The values that a control takes."""
 
 import math
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Tag, model_validator
 
+from lmdsl.common.faults import written
+from lmdsl.common.inputs import is_number
 from lmdsl.common.strict_model import (
     Count,
     Declared,
@@ -78,9 +80,21 @@ class ControlValues(Declared):
         return np.array(self.values)
 
 
+def _spelled_out(value: Any) -> Any:
+    """Refuse the values of a control alone, and say how to write them."""
+    value = plain(value)
+    if isinstance(value, tuple) and all(map(is_number, value)):
+        what = written(value)
+        raise BadInput(f'{what} is not an object; write {{"values": {what}}}')
+    if is_number(value):
+        raise BadInput(f'{value!r} is not an object; write {{"values": [{value!r}]}}')
+    return value
+
+
 ControlUnion = Annotated[
     Annotated[ControlValues, Tag("<values>")] | Annotated[ControlRange, Tag("<other>")],
     tag_by_key({"values": ControlValues}),
+    BeforeValidator(_spelled_out),
 ]
 
 ControlGrid = Annotated[

@@ -107,13 +107,6 @@ class Problem(Declared):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         require_consistent(self)
-        self.step()
-        self.stage() or self.cost()
-        self.terminal()
-        self.density()
-        self.admitted()
-        for where in ("attractor", "avoid", "measure"):
-            self.conditions(where)
         return self
 
     @classmethod

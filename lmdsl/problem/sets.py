@@ -1,10 +1,12 @@
 """Sets of cells: the attractor, what is to be avoided, and where runs start."""
 
 from collections.abc import Mapping
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
+from lmdsl.common.faults import written
+from lmdsl.common.inputs import is_number
 from lmdsl.common.strict_model import Box, Declared, Number, Numbers, frozen_dict, plain
 from lmdsl.errors import BadInput
 from lmdsl.formulas.names import Conditions, FormulaText
@@ -19,16 +21,29 @@ Point = Annotated[
     BeforeValidator(plain),
 ]
 
-Points = Annotated[tuple[Point, ...], Field(fail_fast=True), BeforeValidator(plain)]
+
+def _several(value: Any) -> Any:
+    """Refuse one point or box where a list of them is wanted, and say how to write that."""
+    value = plain(value)
+    one = isinstance(value, dict) or (
+        isinstance(value, tuple) and value and all(map(is_number, value))
+    )
+    if not one:
+        return value
+    what = written(value)
+    raise BadInput(f"{what} stands for one; write a list of them, [{what}]")
+
+
+Points = Annotated[tuple[Point, ...], Field(fail_fast=True), BeforeValidator(_several)]
 
 Boxes = Annotated[
-    tuple[Box, ...], Field(max_length=MAX_BOXES, fail_fast=True), BeforeValidator(plain)
+    tuple[Box, ...], Field(max_length=MAX_BOXES, fail_fast=True), BeforeValidator(_several)
 ]
 
 SomeBoxes = Annotated[
     tuple[Box, ...],
     Field(min_length=1, max_length=MAX_BOXES, fail_fast=True),
-    BeforeValidator(plain),
+    BeforeValidator(_several),
 ]
 
 CellIndex = Annotated[

@@ -49,7 +49,8 @@ def kinds(*models: type[Declared]) -> Any:
     """Return the union of models told apart by their ``kind``."""
     tagged = [Annotated[m, Tag(f"<{m.model_fields['kind'].default}>")] for m in models]
     union: Any = functools.reduce(operator.or_, tagged)
-    names = ", ".join(str(m.model_fields["kind"].default) for m in models)
+    files = [m for m in models if m not in (FunctionSystem, MatrixSystem, DataSystem)]
+    names = ", ".join(str(m.model_fields["kind"].default) for m in files)
     return Annotated[
         union,
         Discriminator(

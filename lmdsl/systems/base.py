@@ -7,11 +7,13 @@ values.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from lmdsl.common import spelling
+from lmdsl.common.faults import require_all
 from lmdsl.common.strict_model import Declared, Positive, plain
 from lmdsl.common.types import Floats, Guard
 from lmdsl.errors import BadInput, shown
@@ -44,20 +46,24 @@ def program(
 
     BadInput: a formula is missing, belongs to no state, or cannot be parsed.
     """
-    for state in order:
+    known, parsed = frozenset((*names, *parameters)), []
+
+    def parse_one(state: str) -> None:
         if state not in formulas:
             raise BadInput(f"no formula for state {state!r}; add one", where)
-    for state in formulas:
-        if state not in order:
-            near = spelling.hint(state, order) or "; remove it or declare the axis"
-            raise BadInput(f"{shown(state)} is not an axis of state_box{near}", where)
-    known = frozenset((*names, *parameters))
-    parsed = []
-    for state in order:
         try:
             parsed.append(parse(formulas[state], known, definitions))
         except BadInput as error:
             raise BadInput(error.message, f"{where}.{state}") from None
+
+    def refuse(state: str) -> None:
+        near = spelling.hint(state, order) or "; remove it or declare the axis"
+        raise BadInput(f"{shown(state)} is not an axis of state_box{near}", where)
+
+    others = [state for state in formulas if state not in order]
+    require_all(
+        [*(partial(refuse, state) for state in others), *(partial(parse_one, x) for x in order)]
+    )
     return Program(parsed, parameters)
 
 

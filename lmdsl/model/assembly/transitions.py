@@ -23,6 +23,7 @@ from lmdsl.model.assembly.estimates import Pilot, estimate, require_least, unles
 from lmdsl.model.assembly.merging import BlockRows, Numbering, merge, merge_one, tile
 from lmdsl.model.assembly.sampler import CHUNK, Block, Sampler
 from lmdsl.model.discretization import Nodes
+from lmdsl.model.grid import boxes
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.rows import Rows, Shares, append_end, code_type
 from lmdsl.model.sets import CellSets
@@ -216,16 +217,19 @@ def _lengths(sampler: Sampler, sets: CellSets, block: Block) -> Indices:
 
 def _refuse_cost(sampler: Sampler, cell: int, control: int) -> None:
     block = Block(0, np.array([cell]), (control, control + 1))
-    for key, sample in sampler.costs_by_key(block, sampler.values(block)).items():
-        faulty = sample[~((sample >= 0) & np.isfinite(sample))].ravel()
-        if not len(faulty):
+    values = sampler.values(block)
+    for key, sample in sampler.costs_by_key(block, values).items():
+        faulty = ~((sample >= 0) & np.isfinite(sample))
+        if not faulty.any():
             continue
-        index = [int(k) for k in np.unravel_index(cell, sampler.partition.shape)]
-        vector = [float(u) for u in sampler.controls[control]]
+        every = np.broadcast_arrays(sample, faulty, *values.values())
+        k = int(every[1].argmax())
+        worst, _, *at = (float(array.flat[k]) for array in every)
+        place = ", ".join(f"{name} = {x + 0.0:.6g}" for name, x in zip(values, at, strict=True))
         raise BadInput(
-            f"the {key.replace('_', ' ')} is {float(faulty[0])!r} at a sample of cell {index} "
-            f"under control {vector}; it must be finite and >= 0 at every sample of every "
-            "admissible pair",
+            f"the {key.replace('_', ' ')} is {worst!r} at {place}, a sample of "
+            f"{boxes.named(sampler.partition, cell)}; it must be finite and >= 0 at every sample "
+            "of every admissible pair: add a constant, square it, or write max(0, ...)",
             key,
         )
     raise BadInput("the mean of the samples overflows; scale the cost down", "stage_cost")

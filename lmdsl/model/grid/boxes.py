@@ -144,6 +144,12 @@ def of_cell(partition: Partition, cell: int) -> Ends:
     return ends(partition, first, np.ones_like(first))
 
 
+def named(partition: Partition, cell: int) -> str:
+    """Return a cell by its index on every axis and its ends, for a message."""
+    index = [int(i) for i in np.unravel_index(cell, partition.shape)]
+    return f"cell {index} ({shown(of_cell(partition, cell))})"
+
+
 def _region(partition: Partition, first: Indices, count: Indices, stride: Indices) -> Region:
     middle = int((((first + count // 2) % partition.cells) * stride).sum())
     return Region(ends(partition, first, count), int(np.prod(count)), middle)

@@ -251,7 +251,8 @@ class Partition(Frozen):
                 raise BadInput(f"{x!r} is too many turns away from the axis", f"{where}.{name}")
             if not (-EDGE <= t <= n + EDGE or axis.low <= state <= axis.high):
                 raise BadInput(
-                    f"{x!r} is outside the axis {name} = [{axis.low!r}, {axis.high!r}]",
+                    f"{x!r} is outside the axis, [{axis.low!r}, {axis.high!r}]; move it inside, "
+                    f"or widen {name} in state_box{_as_degrees(x, axis)}",
                     f"{where}.{name}",
                 )
             touched = np.arange(math.ceil(t - 1 - EDGE), math.floor(t + EDGE) + 1)
@@ -302,6 +303,12 @@ class Partition(Frozen):
             begin, end = max(int(first), 0), min(int(last), n - 1) + 1
             block.append(range(begin, max(begin, end)))
         return tuple(block)
+
+
+def _as_degrees(x: float, axis: AxisCells) -> str:
+    """Return what a number means in degrees, where the axis is about a turn; else nothing."""
+    turn = 0.9 <= (axis.high - axis.low) / math.tau <= 1.1 and abs(x) > math.tau
+    return f" ({x:.6g} degrees are {math.radians(x)!r})" if turn else ""
 
 
 def _units(x: float, low: float, width: float) -> float:
