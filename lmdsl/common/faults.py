@@ -50,7 +50,8 @@ class _Fault(NamedTuple):
 
 def condensed(error: ValidationError, model: Any) -> BadInput:
     """Return all faults of pydantic's report on a model as one error; misspelt keys come first."""
-    faults = [_fault(item, model) for item in error.errors(include_url=False)]
+    items = error.errors(include_url=False)
+    faults = [_fault(item, model) for item in items if not _follows(item)]
     meant = {fault.meant for fault in faults if fault.meant}
     faults = [fault for fault in faults if fault.where not in meant or fault.message != _ADD]
     faults.sort(key=lambda fault: fault.meant is None)
@@ -60,6 +61,11 @@ def condensed(error: ValidationError, model: Any) -> BadInput:
         found.append(BadInput(fault.message + fault.known * (fault.known not in said), fault.where))
         said.add(fault.known)
     return together(found)
+
+
+def _follows(item: Mapping[str, Any]) -> bool:
+    """Return whether a list is called too short because an entry was refused."""
+    return item["type"] == "too_short" and len(item["input"]) >= item["ctx"]["min_length"]
 
 
 def together(faults: Sequence[BadInput]) -> BadInput:
@@ -142,7 +148,7 @@ def _plain(value: Any) -> Any:
 def _unknown(where: str, location: tuple[int | str, ...], model: type[BaseModel]) -> _Fault:
     allowed = sorted({key for kind in _models(model, location[:-1]) for key in kind.model_fields})
     near = spelling.nearest(str(location[-1]), allowed, spelling.KEYS)
-    if near is None and location[-2:-1] in (("<a>",), ("<b>",)):  # of two forms, the other one
+    if near is None and "kind" not in allowed:  # of several forms, another one
         other = {key for kind in _models(model, location[:-2]) for key in kind.model_fields}
         near = spelling.nearest(str(location[-1]), other - {location[-1]}, spelling.KEYS)
     if near is None:

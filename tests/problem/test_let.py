@@ -92,7 +92,7 @@ def test_one_way_in_which_formulas_are_parsed():
         ({"attractor": {"where": []}}, "attractor.where", "at least 1"),
         ({"attractor": {"where": ["x < 1", "x <"]}}, "attractor.where[1]", "ends"),
         ({"attractor": {"where": ["x < 1"] * 101}}, "attractor.where", "100"),
-        ({"attractor": {"where": "x < 0.1"}}, "attractor", "on no cell as a whole"),
+        ({"attractor": {"where": "x < 0.1"}}, "attractor.where", "on no cell as a whole"),
         ({"attractor": {"where": 1}}, "attractor.where", "string"),
         ({"attractor": {"where": [1]}}, "attractor.where[0]", "string"),
         ({"avoid": {"where": "x < 0.1"}}, "avoid", "both attractor and avoid"),

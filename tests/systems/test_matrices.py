@@ -176,7 +176,7 @@ def test_costs_of_states_pairs_and_transitions():
     ([[0.5, 0.5], [0, 1]], [1, 2], {"targets": "goal"}, "targets: 'goal' is a label"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"targets": [0.5]}, "targets: [0.5] are no states"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"targets": ()}, "targets: no target"),
-    ([[0.5, 0.5], [0, 1]], [1, 2], {"avoid": [1]}, "avoid: cell [1] is both attractor and avoid"),
+    ([[0.5, 0.5], [0, 1]], [1, 2], {"avoid": [1]}, "avoid: cell [1] (state in [0.5, 1.5]) is both attractor and avoid"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"maximise": True}, "gamma: 1.0 times the discount"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"layout": "rows"}, "layout: 'rows' is unknown"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"discount": 1}, "discount"),
