@@ -65,7 +65,7 @@ def condensed(error: ValidationError, model: Any) -> BadInput:
 
 def _follows(item: Mapping[str, Any]) -> bool:
     """Return whether a list is called too short because an entry was refused."""
-    return item["type"] == "too_short" and len(item["input"]) >= item["ctx"]["min_length"]
+    return item["type"] == "too_short" and bool(len(item["input"]) >= item["ctx"]["min_length"])
 
 
 def together(faults: Sequence[BadInput]) -> BadInput:

@@ -5,7 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from lmdsl.common import spelling
-from lmdsl.common.faults import require_all
+from lmdsl.common.faults import require_all, written
 from lmdsl.errors import BadInput, shown
 from lmdsl.problem import endings
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
@@ -105,7 +105,7 @@ def _points_named(points: Any, states: tuple[str, ...], where: str) -> None:
             other = next((name for name in point if name not in states), "")
             near = spelling.hint(other, states).replace("; did you mean", "; is", 1)
             near = near and f"{near[:-1]} meant by {shown(other)}?"
-            fault = f"a point names every axis once: {', '.join(states)}"
+            fault = f"{written(dict(point))}: a point names every axis once: {', '.join(states)}"
             raise BadInput(fault + near, f"{where}[{i}]")
         if len(point) != len(states):
             raise BadInput(f"{len(point)} coordinates for {len(states)} axes", f"{where}[{i}]")

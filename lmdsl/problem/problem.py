@@ -181,8 +181,9 @@ class Problem(Declared):
         known = {"state": self.states, "control": self.controls, "noise": self.noises}
         for kind in kinds:
             names.update(known[kind])
+        definitions = self.definitions()  # whose faults are not of this field
         try:
-            return (parse_condition if condition else parse)(text, names, self.definitions())
+            return (parse_condition if condition else parse)(text, names, definitions)
         except BadInput as error:
             raise BadInput(error.message, where) from None
 

@@ -1,0 +1,120 @@
+"""Every fault of a problem is named at once, in words of JSON; see docs/messages.md too."""
+
+from __future__ import annotations
+
+import pytest
+from problems import made, steps
+
+import lmdsl as lm
+from lmdsl.common.faults import MOST_FAULTS, written
+
+
+def said(**changes):
+    with pytest.raises(lm.BadInput) as caught:
+        lm.compile(made({**steps(), **changes}))
+    return str(caught.value)
+
+
+def test_every_fault_is_named_up_to_twenty():
+    wrong = {f"key{k:02}": 1 for k in range(MOST_FAULTS)}
+    text = said(**wrong)
+    assert all(f"{name}: unknown key" in text for name in wrong)
+    assert " more" not in text
+    assert text.count("known keys:") == 1
+    text = said(**wrong, another=1, yet_another=1)
+    assert text.endswith("; and 2 more")
+
+
+def test_formulas_and_sets_are_judged_together():
+    text = said(
+        system={"kind": "map", "next": {"x": "x + nobody", "y": "x"}},
+        stage_cost="cost",
+        attractor={"boxes": [{"z": [0, 1]}, {"x": [1, 0]}]},
+        avoid={"boxes": [{"w": [0, 1]}]},
+        noise={"u": {"values": [0], "weights": [1]}},
+        measure={"density": "q"},
+    )
+    for place in (
+        "system.next: 'y'", "system.next.x: character 5: 'nobody'", "stage_cost: character 1:",
+        "attractor.boxes[0]: 'z'", "attractor.boxes[1].x: [1.0, 0.0] is empty",
+        "avoid.boxes[0]: 'w'", "noise: the name 'u'", "measure.density: character 1: 'q'",
+    ):  # fmt: skip
+        assert place in text, place
+
+
+def test_what_a_definition_lacks_is_said_once():
+    text = said(let={"d": "nobody"}, stage_cost="d", admissible="d > 0")
+    assert text.count("nobody") == 1
+    assert text.startswith("let.d: ")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (True, "true"),
+        (None, "null"),
+        ([1, None], "[1, null]"),
+        ({"a": False}, '{"a": false}'),
+        (list(range(9)), "a list of 9 entries"),
+        (dict.fromkeys("abcdefghi"), "an object of 9 keys"),
+        ((1, 2), "[1, 2]"),
+        ([object], "[<class 'object'>]"),
+    ],
+)
+def test_values_are_written_as_json_has_them(value, text):
+    assert written(value) == text
+    assert len(written(["x" * 1000])) < 200
+
+
+def test_a_cell_is_named_with_its_ends():
+    both = said(avoid={"boxes": [{"x": [0.1, 0.9]}]})
+    assert both.startswith("avoid: cell [0] (x in [0, 0.25]) is both")
+    # Cell 1 is the first free one; its first sample lies at 0.3125.
+    cost = said(stage_cost="x - 0.5 + 0*u")
+    assert "is -0.1875 at x = 0.3125, u = 0, a sample of cell [1] (x in [0.25, 0.5])" in cost
+    density = said(measure={"density": "x - 0.5"})
+    assert "-0.375 in cell [0] (x in [0, 0.25])" in density
+
+
+def test_the_sample_at_fault_is_the_one_named():
+    # Only the second sample of the cell under the second control is negative.
+    cost = said(stage_cost="where(x > 0.4, 1 - 2*u, 1)")
+    assert "is -1.0 at x = 0.4375, u = 1, a sample of cell [1]" in cost
+
+
+def test_boxes_without_a_cell_are_told_what_to_write():
+    text = said(attractor={"boxes": [{"x": [0.3, 0.4]}]})
+    assert text.startswith("attractor.boxes[0].x: [0.3, 0.4] holds no whole cell")
+    assert "write [0.25, 0.5]" in text
+    lm.compile(made({**steps(), "attractor": {"boxes": [{"x": [0.25, 0.5]}]}}))
+    assert "lies outside the axis" in said(attractor={"boxes": [{"x": [2, 3]}]})
+    assert "measure.boxes[0].x" in said(measure={"boxes": [{"x": [0.3, 0.4]}]})
+
+
+def test_an_angle_in_degrees_outside_its_axis():
+    box = {"x": {"low": -3.14159, "high": 3.14159, "cells": 20}}
+    text = said(state_box=box, attractor={"points": [[180]]})
+    assert "180 degrees are 3.141592653589793" in text
+    assert "degrees" not in said(state_box=box, attractor={"points": [[4]]})
+
+
+@pytest.mark.parametrize(
+    ("change", "fix"),
+    [
+        ({"attractor": {"points": [1, 0]}}, "[[1, 0]]"),
+        ({"attractor": {"points": {"x": 0}}}, '[{"x": 0}]'),
+        ({"avoid": {"boxes": {"x": [0, 1]}}}, '[{"x": [0, 1]}]'),
+        ({"control_grid": {"u": [-0.3, 0, 0.3]}}, '{"values": [-0.3, 0, 0.3]}'),
+        ({"control_grid": {"u": 2}}, '{"values": [2]}'),
+        ({"state_box": {"x": [-1, 1]}}, '{"low": -1, "high": 1, "cells": 50}'),
+    ],
+)
+def test_the_fix_is_written_out(change, fix):
+    assert fix in said(**change)
+
+
+def test_kinds_that_no_file_holds_are_not_offered():
+    text = said(system={"kind": "ODE", "derivative": {"x": "u"}, "step": 1})
+    assert "did you mean 'ode'?" in text
+    assert "function" not in text
+    assert "matrices" not in text
