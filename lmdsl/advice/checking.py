@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from lmdsl.advice import declaration, motion, sizes
+from lmdsl.advice import declaration, motion, recorded, sizes
 from lmdsl.advice.report import CheckReport, Finding
 from lmdsl.advice.survey import MOST_SETS, Survey
 from lmdsl.common import inputs
@@ -52,6 +52,7 @@ def check(
     if isinstance(problem.system, MatrixSystem):
         level, found = sizes.of_matrices(problem, deadline)
         known = [level]
+        findings += recorded.few(problem)
     else:
         partition = Partition.of(problem)
         if partition.size <= MOST_SETS:

@@ -111,9 +111,14 @@ def _least(count: Indices, total: Indices, tail: float) -> Floats:
 
 def unseen(seen: Observed, family: Family, level: float) -> Floats:
     """Return the upper limit of the mass of each pair on what was not observed, shape (K,)."""
+    return unseen_of(np.diff(seen.pointer), seen.total, family, level)
+
+
+def unseen_of(k: Indices, total: Indices, family: Family, level: float) -> Floats:
+    """Return the same of pairs of which ``total`` draws fell in k outcomes."""
     from scipy.special import gammaln
 
-    E, k = float(family.outcomes), np.diff(seen.pointer)
+    E = float(family.outcomes)
     sets = gammaln(E + 1) - gammaln(k + 1.0) - gammaln(E - k + 1.0)
     chance = np.log1p(-level) - np.log(family.pairs) - np.log(E)
-    return np.where(k < E, -np.expm1((chance - sets) / seen.total), 0.0)
+    return np.where(k < E, -np.expm1((chance - sets) / total), 0.0)

@@ -192,3 +192,16 @@ def test_spoiled_rows_are_refused(saved, tmp_path, name, change, place):
     except lm.BadInput:
         return
     assert not (found.holds and found.same_model)
+
+
+def test_check_says_where_data_are_few():
+    """Cell 3 has no data under either control, cell 1 and 2 none or 4 under 1: 3 of 6 pairs."""
+    (few, *_) = lm.check(problem()).findings
+    assert few.code == "few_data"
+    assert few.figures["missing"] == pytest.approx(1 / 2)
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(0, 2, 10_000), rng.integers(0, 2, 10_000)
+    assert not lm.check(lm.from_data(x, u, 0.7 * x, **KEYS)).findings
+    wanted = few.figures["wanted"]  # of one more draw a pair the limit is what it aims at
+    enough = lm.from_data([1.1] * wanted, [0] * wanted, [0.2] * wanted, **KEYS)
+    assert 0.05 < lm.solve(enough).data.unseen[1] <= 0.1
