@@ -12,7 +12,7 @@ import numpy as np
 
 from lmdsl.common.types import Bools, Floats, Guard, Indices, Statuses
 from lmdsl.machine.kernels import fixed, kernel
-from lmdsl.model.assembly.paths import free_room
+from lmdsl.model.assembly.paths.arcs import free_room
 from lmdsl.model.grid.axis import on_circle, on_interval
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus

@@ -8,7 +8,7 @@ from lmdsl.common.types import Floats, Guard
 from lmdsl.control.integration import Moved
 from lmdsl.machine.forking import cached_property
 from lmdsl.model.assembly.entries import integrated
-from lmdsl.model.assembly.paths import PathJudge
+from lmdsl.model.assembly.paths.judging import PathJudge
 from lmdsl.model.discretization import noise_nodes
 from lmdsl.model.sets import CellSets
 from lmdsl.model.true_map import TrueMap

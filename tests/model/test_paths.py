@@ -114,7 +114,10 @@ def test_maps_have_no_path():
 
 @pytest.mark.parametrize("seed", range(60))
 def test_what_is_skipped_is_free(seed):
-    """Places that cannot matter are not looked at: the answer is that of looking at all."""
+    """Places that cannot matter are not looked at: the answer is that of looking at all.
+
+    So is that of looking at a few samples at a time.
+    """
     data = _attempt(np.random.default_rng(seed))
     if data["system"]["kind"] != "ode" or data["system"].get("judged") == "endpoint":
         return
@@ -123,8 +126,13 @@ def test_what_is_skipped_is_free(seed):
     block = Block(0, np.arange(sampler.partition.size), (0, len(sampler.controls)))
     values = sampler.values(block)
     fast = sampler.images(block, values)
+    costs, places = sampler.costs(block, values), sampler.places(block)
     sampler._entries.path.ground.room[:] = 0
     assert np.array_equal(sampler.images(block, values), fast, equal_nan=True)
+    sampler._entries.path.most = 7
+    assert np.array_equal(sampler.images(block, values), fast, equal_nan=True)
+    assert np.array_equal(sampler.places(block), places, equal_nan=True)
+    assert np.array_equal(sampler.costs(block, values), costs, equal_nan=True)
 
 
 # what it costs ----------------------------------------------------------------------------------

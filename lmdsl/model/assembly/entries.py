@@ -11,7 +11,7 @@ import numpy as np
 
 from lmdsl.common.types import Floats, Guard
 from lmdsl.formulas.program import Program
-from lmdsl.model.assembly.paths import Endings, PathJudge
+from lmdsl.model.assembly.paths.judging import Endings, PathJudge, path_doubles
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.problem.problem import Problem
@@ -25,13 +25,10 @@ def integrated(problem: Problem) -> RungeKutta | None:
     return problem.flow()
 
 
-def path_doubles(problem: Problem) -> int:
+def doubles(problem: Problem) -> int:
     """Return how many doubles a sample takes whose path is kept."""
     flow = integrated(problem)
-    if flow is None:
-        return 0
-    outputs = len(flow.field.formulas)
-    return 2 * (flow.substeps + 1) * outputs + 4 * flow.substeps * flow.integrals + outputs
+    return 0 if flow is None else path_doubles(flow)
 
 
 class Entries:

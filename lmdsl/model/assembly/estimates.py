@@ -7,7 +7,8 @@ from lmdsl.formulas.program import Program
 from lmdsl.machine import memory, threads
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model import discretization
-from lmdsl.model.assembly.entries import path_doubles
+from lmdsl.model.assembly.entries import doubles
+from lmdsl.model.assembly.paths.judging import KEPT
 from lmdsl.model.assembly.sampler import CHUNK, chunk
 from lmdsl.problem.problem import Problem
 
@@ -69,7 +70,9 @@ def _blocks(problem: Problem, S: int) -> int:
     if condition is not None:
         others.append(Program([condition], problem.system.constants()))
     live = max(step.live, *(other.live for other in others)) if others else step.live
-    each = 8 * samples * (3 * d + live + 8 + path_doubles(problem))
+    each = 8 * samples * (3 * d + live + 8)
+    if doubles(problem):
+        each += 8 * max(KEPT, doubles(problem))
     waiting = 8 * (count - 1) * 16 * samples  # finished blocks, for their turn
     return count * each + waiting
 
@@ -105,7 +108,7 @@ def work(problem: Problem) -> float:
     if cost is None:  # a rate, of the same names
         cost = Program([problem.cost()], problem.system.constants())
     calls = 2 + 2 * lanes * min(samples, CHUNK) // CHUNK
-    locating = SAMPLE * (1 + path_doubles(problem) // 8)
+    locating = SAMPLE * (1 + doubles(problem) // 8)
     work = lanes * samples * (locating + step.work + cost.work)
     condition = problem.admitted()
     if condition is not None:

@@ -18,10 +18,10 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import fixed
 from lmdsl.model import discretization
 from lmdsl.model.assembly.asked import Asked
-from lmdsl.model.assembly.entries import Entries, path_doubles
+from lmdsl.model.assembly.entries import Entries, doubles
 from lmdsl.model.assembly.lines import Lines
 from lmdsl.model.assembly.merging import mean_cost
-from lmdsl.model.assembly.paths import Endings
+from lmdsl.model.assembly.paths.judging import Endings
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.model.true_map import TrueMap
@@ -257,7 +257,7 @@ class Sampler:
 
 def chunk(problem: Problem) -> int:
     """Return how many samples are evaluated at a time: fewer where each keeps a long path."""
-    return max(1, CHUNK * SHORT_PATH // max(SHORT_PATH, path_doubles(problem)))
+    return max(1, CHUNK * SHORT_PATH // max(SHORT_PATH, doubles(problem)))
 
 
 def _written(problem: Problem, step: StateMap) -> StateMap:

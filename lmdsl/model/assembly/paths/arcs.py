@@ -1,53 +1,17 @@
-"""The way of a sample through the box: where it first enters the attractor, avoid or the outside.
+"""Compiled loops over the arcs of paths, and over the ground that they cross."""
 
-The path of a Runge-Kutta step is a cubic Hermite arc for each substep. It is judged at its parts
-in order, from the first after the start to the image, and the earliest event decides: entering the
-attractor absorbs the sample there; leaving the box or entering avoid is an escape.
-"""
-
-import math
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Floats, Guard
+from lmdsl.common.types import Bools, Floats
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.axis import on_circle, on_interval
-from lmdsl.model.grid.partition import Partition
-from lmdsl.model.sets import CellSets
-from lmdsl.systems.runge_kutta import RungeKutta
 
-MOST_PARTS = 1_000
-"""Parts of an arc at most; else twice as many as it is cells long, by its steepest end."""
+MOST_PARTS = 1_000  # most parts of an arc; else twice as many as its steepest end is cells long
 
-FAR = 8
-"""Distances in cells from what decides a path are told apart up to this one."""
-
-
-NOWHERE = -2
-"""Number of no set of cells: one that no path enters."""
-
-
-class Endings(NamedTuple):
-    """What became of samples.
-
-    Attributes
-    ----------
-    cell
-        Index of the cell that decides: of the first event, or of the image; NaN outside. It has
-        the shape of the samples.
-    place
-        Where that is, not wrapped, shape (d, samples), or (0, samples) where nobody asks.
-    integral
-        Integral of the cost rate until then, NaN where the rate was negative or not a number on
-        the way; shape (samples,), or (0,) without a rate.
-    """
-
-    cell: Floats
-    place: Floats
-    integral: Floats
+FAR = 8  # number of cells above which distances from what decides a path are not told apart
 
 
 class Arcs(NamedTuple):
@@ -94,90 +58,6 @@ class Ground(NamedTuple):
     forbid: bool
 
 
-class PathJudge:
-    """Judges the paths of samples; it may be called from several threads at once.
-
-    Parameters
-    ----------
-    flow
-        Integrates the equation, and the cost rate where there is one.
-    partition, sets
-        The box and its sets.
-    endpoint
-        Whether only the image is judged.
-    absorb
-        Whether entering the attractor is an event.
-    """
-
-    def __init__(
-        self,
-        flow: RungeKutta,
-        partition: Partition,
-        sets: CellSets,
-        endpoint: bool,
-        absorb: bool = True,
-    ) -> None:
-        self.flow, self.partition, self.endpoint = flow, partition, endpoint
-        free = (sets.number >= 0) & ~sets.attractor
-        self.ground = Ground(
-            np.array(partition.axes, dtype=np.float64),
-            sets.number,
-            len(sets.free) if absorb else NOWHERE,
-            free_room(free.reshape(partition.shape), partition.periodic),
-            not partition.clip,
-        )
-
-    def __call__(
-        self, values: Mapping[str, Floats], shape: tuple[int, ...], guard: Guard, places: bool
-    ) -> Endings:
-        """Judge samples given as named arrays that broadcast to ``shape``; see :class:`Endings`."""
-        flow, d, integrals = self.flow, self.partition.dimension, self.flow.integrals
-        count, arcs = math.prod(shape), flow.substeps
-        state, slope, rate = self._knots(values, shape, guard)
-        knots = self._cells(state, count)
-        cell, arc, time = np.empty(count), np.full(count, arcs - 1), np.ones(count)
-        if self.endpoint:
-            cell = knots[-1]
-        else:
-            speed, parts = np.zeros((arcs, count)), np.zeros(count)
-            _speeds(state, slope, self.ground.axes, speed, parts)
-            _judge(Arcs(state, slope, knots, speed, parts), self.ground, cell, arc, time)
-        place, integral = np.empty((d if places else 0, count)), np.empty(count * integrals)
-        _places(state, slope, arc, time, place)
-        if integrals:
-            _integrals(state, slope, rate, d, arc, time, integral)
-        return Endings(cell.reshape(shape), place, integral)
-
-    def _knots(
-        self, values: Mapping[str, Floats], shape: tuple[int, ...], guard: Guard
-    ) -> tuple[Floats, Floats, Floats]:
-        """Return the knots' states and slopes and the integrand at the stages; see _judge."""
-        flow = self.flow
-        outputs, integrals, arcs = len(flow.field.formulas), flow.integrals, flow.substeps
-        state, slope = (np.empty((arcs + 1, outputs, *shape)) for _ in range(2))
-        rate = np.empty((arcs, 4 * integrals, *shape))
-        for s, knot in enumerate(flow.knots(values, guard)):
-            for k in range(outputs):
-                state[s, k], slope[s, k] = knot.state[k], knot.slope[k]
-            for i, stage in enumerate(knot.stages):
-                for k in range(integrals):
-                    rate[s, 4 * k + i] = stage[k]
-        state, slope, rate = (
-            x.reshape(*x.shape[:2], math.prod(shape)) for x in (state, slope, rate)
-        )
-        return state, slope, rate
-
-    def _cells(self, state: Floats, count: int) -> Floats:
-        """Return the cells of the knots, NaN outside; under ``clip`` the image is moved first."""
-        cells = np.empty((len(state), count))
-        for s, knot in enumerate(state):
-            last = s == len(state) - 1
-            cells[s] = self.partition.index(
-                list(knot[: self.partition.dimension]), self.partition.clip and last
-            )
-        return cells
-
-
 def free_room(free: Bools, periodic: Bools) -> NDArray[np.uint8]:
     """Return how near, in cells, something else than a free cell may be to each cell, at most FAR.
 
@@ -196,7 +76,7 @@ def free_room(free: Bools, periodic: Bools) -> NDArray[np.uint8]:
 
 
 @kernel
-def _speeds(state, slope, axes, speed, parts):  # type: ignore[no-untyped-def]
+def speeds(state, slope, axes, speed, parts):  # type: ignore[no-untyped-def]
     """Fill in ``speed`` and ``parts`` of :class:`Arcs`, zeros on entry."""
     count = np.uint64(len(parts))
     for k in range(len(axes)):
@@ -243,7 +123,7 @@ def _hermite(state, slope, s, t, k, i):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _judge(arcs, ground, cell, arc, time):  # type: ignore[no-untyped-def]
+def judge(arcs, ground, cell, arc, time):  # type: ignore[no-untyped-def]
     """Fill in which cell decides, on which arc and when on it; see :class:`Endings`."""
     state, slope, knots, speed, parts = arcs
     axes, number, attractor, room, forbid = ground
@@ -269,7 +149,7 @@ def _judge(arcs, ground, cell, arc, time):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _places(state, slope, arc, time, place):  # type: ignore[no-untyped-def]
+def places(state, slope, arc, time, place):  # type: ignore[no-untyped-def]
     """Fill in where the samples are then, shape (d, samples); at the end of an arc exactly."""
     for k in range(len(place)):
         for i in range(len(arc)):
@@ -280,7 +160,7 @@ def _places(state, slope, arc, time, place):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _integrals(state, slope, rate, k, arc, time, integral):  # type: ignore[no-untyped-def]
+def integrals(state, slope, rate, k, arc, time, integral):  # type: ignore[no-untyped-def]
     """Fill in component k, an integral, until then; it never decreases along an arc.
 
     Where the integrand was negative or not a number before, it is that.
