@@ -176,7 +176,7 @@ def test_it_survives_saving_and_a_false_one_is_found(tmp_path):
         ({"kind": "constant", "control": {"u": 2}}, "control.u: 2.0 is outside the control grid"),
         ({"kind": "lqr", "orbit": []}, "local_controller.orbit: "),
         ({"kind": "lqr", "orbit": [[0.25]]}, "orbit[0]: 1 coordinates for 2 axes"),
-        ({"kind": "lqr", "orbit": [{"x": 0.25, "z": 0}]}, "orbit[0]: a point names every axis"),
+        ({"kind": "lqr", "orbit": [{"x": 0.25, "z": 0}]}, "a point names every axis"),
         ({"kind": "lqr", "orbit": [[0.25, 0.5]]}, "orbit: point 0 is mapped to [0.75, 0.5], 25"),
         ({"kind": "lqr", "orbit": [[0.1, 0.5], [0.6, 0.5]]}, "orbit[0]: the point lies in no"),
         ({"kind": "lqr", "orbit": ORBIT, "state_weights": {"x": 0}}, "state_weights.x: 0"),

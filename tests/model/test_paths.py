@@ -165,7 +165,7 @@ def test_a_rate_is_integrated_until_the_attractor():
 
 
 def test_a_rate_that_is_negative_on_the_way_is_refused():
-    with pytest.raises(lm.BadInput, match=r"cost_rate: the cost rate is -0\.\d+ at a sample"):
+    with pytest.raises(lm.BadInput, match=r"cost_rate: the cost rate is -0\.\d+ at x = "):
         lm.compile(decay(cost_rate="x - 0.6", attractor={"boxes": [{"x": [0, 0.4]}]}))
 
 
