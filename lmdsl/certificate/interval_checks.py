@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmdsl.certificate.sums import UNIT
+from lmdsl.certificate.sums import LEAST, UNIT
 from lmdsl.common.records import Frozen
 from lmdsl.common.types import Bools, Floats, Indices
 
@@ -52,7 +52,7 @@ def _bound(
     away = V[rows.target] - t[owner]
     terms = np.where(away > 0, above, below) * away
     size = np.abs(t) + np.add.reduceat(np.abs(terms), start)
-    slack = (np.diff(rows.pointer) + OPERATIONS) * UNIT * size
+    slack = (np.diff(rows.pointer) + OPERATIONS) * (UNIT * size + LEAST)
     found: Floats = t + np.add.reduceat(terms, start) + direction * 2 * slack
     return found
 

@@ -44,6 +44,7 @@ def binned(
     BadInput
         A control is not on the grid, or the stage cost is none at a recorded state.
     """
+    given = given._replace(x=partition.states(given.x, clip=False))
     cell = partition.locate(list(given.x.T), clip=False)
     control, off = matched(problem, given.u, wishes.tolerance)
     if off.any() and not wishes.drop:

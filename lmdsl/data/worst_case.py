@@ -16,6 +16,7 @@ from lmdsl.certificate.interval_checks import IntervalRows
 from lmdsl.certificate.sums import UNIT
 from lmdsl.common.types import Floats, Guard
 
+LEAST_MARGIN = 0.5  # of w: it is about 1 where w is what it should be
 MOST_STEPS, CLOSE, TRIES = 200, 1e-11, 8
 
 
@@ -66,8 +67,9 @@ def bounds(
     V = None if w is None else _value(rows, G, up, 1.0, guard)
     if w is None or V is None:
         return nothing
-    margin = w - growth * interval_checks.most(rows, _padded(w), _threshold(rows, w, 1.0))
-    if not margin.min() > 0:
+    t = _threshold(rows, w, 1.0)
+    margin = w - growth * interval_checks.most(rows, _padded(w), t)
+    if not interval_checks.is_above(rows, np.full(n, LEAST_MARGIN), growth, w, t).all():
         return nothing
     high = _lifted(rows, G, up, V, w, float(margin.min()))
     if high is None:

@@ -279,3 +279,11 @@ def test_no_file_declares_data():
     problem = lm.from_data([0.6], [0], [0.1], **KEYS)
     with pytest.raises(lm.BadInput, match="save the result"):
         problem.to_json()
+
+
+def test_a_state_on_a_circle_is_wrapped_before_it_is_paid_for():
+    box = {"x": {"low": 0, "high": 2, "cells": 4, "periodic": True}}
+    keys = KEYS | {"state_box": box, "stage_cost": "x"}
+    turned = lm.from_data([2.75, -1.25, 0.75], [0, 0, 0], [4.25, -1.75, 0.25], **keys)
+    assert turned == lm.from_data([0.75] * 3, [0] * 3, [0.25] * 3, **keys)
+    assert turned.system.rows.cost.tolist() == [0.75]
