@@ -19,7 +19,7 @@ def pendulum(torque: float) -> lm.Problem:
             "kind": "inverted_pendulum",
             "parameters": {"m": 1, "l": 1, "g": 9.81, "d": 0.1},
             "step": 0.1,
-            "substeps": 2,
+            "substeps": "auto",
         },
         state_box={
             "theta": {"low": -pi, "high": pi, "cells": 64, "periodic": True},

@@ -150,7 +150,10 @@ class _Job:
     def _integration_error(self) -> IntegrationError | None:
         """Judge the compiled steps, where there is time."""
         try:
-            return integration_error(self.lp.problem, deadline=self.finish)
+            lp = self.lp
+            given = np.isin(lp.cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID))
+            free = np.flatnonzero(~given)
+            return integration_error(lp.problem, free, self.finish)
         except TimeLimitReached:
             return None
 

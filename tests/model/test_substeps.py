@@ -125,3 +125,9 @@ def test_what_init_writes_settles_below_a_hundredth(name):
     found = integration_error(problem)
     assert found.halving < 0.01
     assert found.accurate < 0.011
+
+
+def test_a_short_problem_is_settled_whatever_the_limit():
+    result = lm.solve(made(decay(-10.0, "auto")), time_limit=1e-9)
+    assert result.problem.system.substeps > 1
+    assert result.integration_error is None or result.integration_error.halving < 0.01

@@ -10,9 +10,10 @@ from functools import partial
 import numpy as np
 
 from lmdsl.common.records import Reported
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Indices
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model import discretization
+from lmdsl.model.assembly.estimates import unless_short
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.problem.problem import Problem
@@ -71,16 +72,18 @@ class IntegrationError(Reported):
 
 
 def integration_error(
-    problem: Problem, sets: CellSets | None = None, deadline: Deadline | None = None
+    problem: Problem, free: Indices | None = None, deadline: Deadline | None = None
 ) -> IntegrationError | None:
     """Return how far the compiled steps of a problem are from its equation; None for a map.
+
+    ``free`` are the cells outside A and Z, where they are known.
 
     Raises
     ------
     TimeLimitReached
         The deadline has passed.
     """
-    pairs = _Pairs.of(problem, sets, deadline)
+    pairs = _Pairs.of(problem, free, deadline)
     if pairs is None:
         return None
     flow, count = pairs.flow, pairs.flow.substeps
@@ -94,6 +97,8 @@ def integration_error(
 def settled(problem: Problem, deadline: Deadline | None = None) -> Problem:
     """Return a problem whose substeps are a number: ``auto`` is as many as it takes.
 
+    What compiles in a moment is settled whatever the deadline.
+
     Raises
     ------
     TimeLimitReached
@@ -101,7 +106,7 @@ def settled(problem: Problem, deadline: Deadline | None = None) -> Problem:
     """
     if getattr(problem.system, "substeps", None) != "auto":
         return problem
-    pairs, count = _Pairs.of(problem, None, deadline), 1
+    pairs, count = _Pairs.of(problem, None, unless_short(problem, Deadline.of(deadline))), 1
     assert pairs is not None
     coarse = pairs.images(1)
     while pairs.count and 2 * count <= MOST:
@@ -127,7 +132,7 @@ class _Pairs:
 
     @classmethod
     def of(
-        cls, problem: Problem, sets: CellSets | None, deadline: Deadline | None
+        cls, problem: Problem, free: Indices | None, deadline: Deadline | None
     ) -> "_Pairs | None":
         """Draw the pairs of a problem; None for a map."""
         names = (problem.states, problem.controls, problem.noises)
@@ -135,13 +140,14 @@ class _Pairs:
         if flow is None:
             return None
         partition, deadline = Partition.of(problem), Deadline.of(deadline)
-        sets = sets or CellSets.of(problem, partition, deadline)
+        if free is None:
+            free = CellSets.of(problem, partition, deadline).free
+        free = free if len(free) else np.arange(1)
         rng = np.random.default_rng(0)
 
         def some(rows: Floats) -> Floats:
             return rows[rng.integers(len(rows), size=PAIRS)].T
 
-        free = sets.free if len(sets.free) else np.flatnonzero(sets.attractor)
         cells = free[rng.integers(len(free), size=PAIRS)]
         offsets = some(discretization.offsets(problem))
         index = partition.multi_index(cells)
