@@ -78,6 +78,12 @@ class Normal(Declared):
     points: Annotated[int, Field(strict=True, ge=1, le=MAX_HERMITE), BeforeValidator(plain)]
     within: Positive | None = None
 
+    @model_validator(mode="after")
+    def _finite(self) -> Self:
+        if not math.isfinite((self.within or 0.0) * self.std):
+            raise BadInput(f"{self.within!r} deviations are too far for doubles", "within")
+        return self
+
 
 class NoiseNormal(Declared):
     """A normally distributed noise variable."""
@@ -118,6 +124,8 @@ class Uniform(Declared):
     def _ordered(self) -> Self:
         if not self.low < self.high:
             raise BadInput(f"{self.low!r} is not below high = {self.high!r}", "low")
+        if not math.isfinite(self.high - self.low):
+            raise BadInput(f"{self.high!r} is too far from low for doubles", "high")
         return self
 
 
