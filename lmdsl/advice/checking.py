@@ -74,4 +74,4 @@ def _of_the_map(survey: Survey, share: float | None, deadline: Deadline) -> Iter
     yield from declaration.degrees(survey)
     yield from motion.on_edges(survey)
     yield from motion.short_step(survey, share, deadline)
-    yield from motion.long_step(survey)
+    yield from motion.long_step(survey, share)

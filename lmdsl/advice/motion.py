@@ -13,7 +13,7 @@ from lmdsl.explanation import remedies
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid.partition import MAX_CELLS, Partition
 
-STUCK = 0.02  # share of cells tried that keep their samples from which on a step is too short
+STUCK = 0.05  # share of cells tried that keep their samples from which on a step is too short
 COVERED = 0.9  # share of the cells stabilized from which on no longer step is looked for
 WIDE = 2.0  # widths of a cell from which on the median sample moves far enough
 CURED = 0.1  # the part of that share that a remedy may leave
@@ -29,15 +29,17 @@ def short_step(survey: Survey, share: float | None, deadline: Deadline) -> Itera
 
     ``share`` is that of the problem's cells that can be stabilized, None if it is not known.
     """
-    cells = survey.cells[survey.stays]
+    # What moves by a width and stays was turned round a circle, or back into the box.
+    slow_ones = survey.stays & (survey.moved < 1)
+    cells = survey.cells[slow_ones]
     count, tried = len(cells), len(survey.cells)
-    if share == 1:
+    if share == 1 or not tried:
         return  # a discount, say, ends what stays
     many = count >= max(STUCK * tried, 1)
-    slow = tried > 0 and share is not None and share < COVERED
+    slow = share is not None and share < COVERED
     if not many and not (slow and float(np.median(survey.moved)) < WIDE):
         return
-    of = survey.stays if many else np.ones(tried, dtype=np.bool_)
+    of = slow_ones if many else np.ones(tried, dtype=np.bool_)
     moved = float(np.median(survey.moved[of]))
     figures: dict[str, Any] = {"cells": count, "tried": tried, "moved": moved}
     parts = [*_longer(survey, cells, share, figures, deadline)]
@@ -156,9 +158,14 @@ def _off_edges(survey: Survey, axis: int) -> tuple[int, float] | None:
     return None
 
 
-def long_step(survey: Survey) -> Iterator[Finding]:
-    """Find that samples beside A jump over it; nothing where the whole path is judged."""
-    if survey.sets is None or survey.problem.judged == "path":
+def long_step(survey: Survey, share: float | None) -> Iterator[Finding]:
+    """Find that samples beside A jump over it, where too little can be stabilized or is known.
+
+    Nothing where the whole path is judged.
+    """
+    if share is not None and share >= COVERED:
+        return
+    if survey.sets is None or survey.problem.judged == "path" or not len(survey.cells):
         return
     p, attractor = survey.partition, survey.sets.attractor
     if float(np.median(survey.moved)) * float((p.width / survey.span).min()) > JUMP:

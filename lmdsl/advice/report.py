@@ -46,7 +46,8 @@ class Expectation(Reported):
     admissible
         Share of the pairs from which no sample leaves.
     coverage
-        Share of the cells outside attractor and avoid that can be stabilized; null if unknown.
+        Share of the cells outside attractor and avoid that can be stabilized; None if unknown, or
+        if there is no such cell.
     coverage_cells
         The cells of each axis for which it was computed; the problem's own where that is cheap.
     memory, available
@@ -71,7 +72,9 @@ class Expectation(Reported):
             f"{self.cells:,} cells, {self.controls:,} controls, {self.samples:,} samples of each "
             f"pair; {100 * self.admissible:.3g} % of the pairs tried are admissible"
         ]
-        if self.coverage is None:
+        if self.coverage is None and self.coverage_cells == own:
+            lines.append("coverage: no cell lies outside attractor and avoid")
+        elif self.coverage is None:
             lines.append("coverage: not known without the whole compilation")
         else:
             of = "" if self.coverage_cells == own else f" on a grid of {shape(self.coverage_cells)}"

@@ -117,5 +117,8 @@ class Survey(Variant):
     ) -> Floats:
         far = np.zeros(shape)
         for k, (x, image) in enumerate(zip(start, images, strict=True)):
-            np.fmax(far, np.abs(image - x) / self.partition.width[k], out=far)
+            away = image - x
+            if self.partition.periodic[k]:
+                away = away - np.round(away / self.span[k]) * self.span[k]
+            np.fmax(far, np.abs(away) / self.partition.width[k], out=far)
         return np.asarray(np.median(far.max(axis=1), axis=(1, 2)))

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import math
 
+import numpy as np
 import pytest
 from problems import made, standard_map
+from random_problems import random_problem
 
 import lmdsl as lm
 from lmdsl.advice import sizes
@@ -111,7 +113,7 @@ def test_a_step_so_short_that_cells_stay_put():
 
 def test_a_step_that_moves_every_cell_may_still_be_too_short():
     figures = found(pendulum(0.02))["short_step"].figures
-    assert figures["cells"] <= 0.02 * figures["tried"]
+    assert figures["cells"] <= 0.05 * figures["tried"]
     assert figures["share"] < 0.1 < 0.8 < figures["share_then"]
 
 
@@ -390,3 +392,21 @@ def test_boxes_of_an_attractor_across_the_seam():
         problem = made({**data, "attractor": {"boxes": boxes}})
         cells = (lm.compile(problem).cell_status == lm.CellStatus.ATTRACTOR).sum()
         assert cells == (2 + 2 * grow) ** 2
+
+
+@pytest.mark.parametrize("block", range(4))
+def test_random_problems_are_checked_as_they_are_solved(block):
+    """Nothing breaks, and the coverage of a small problem is that of its solution."""
+    for i in range(10):
+        problem = made(random_problem(np.random.default_rng([80 + block, i])))
+        report = lm.check(problem)
+        assert report.expected.coverage_cells == report.axes
+        assert report.expected.coverage == lm.solve(problem).coverage.share
+        json.dumps(report.to_dict(), allow_nan=False)
+
+
+def test_what_wraps_or_is_clipped_into_its_cell_is_no_short_step():
+    for more in ({"on_exit": "clip"}, {}):
+        data = shift("8*u", controls=(-1, 1), **more)
+        data["state_box"]["x"]["periodic"] = not more
+        assert "short_step" not in found(data)
