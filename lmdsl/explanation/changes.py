@@ -7,8 +7,10 @@ periodic axis   the map does not change when a state is moved by the length of i
 box attractor   the attractor is the cells around points: with a box that also has the cells around
                 these, more can be stabilized, and it does not shrink with the cells.
 
-A hint is given if the share of the cells that can be stabilized rises by at least a tenth, and
-where compiling takes a moment. The figures are those of the compilations.
+A hint is given if the share of the cells that can be stabilized rises by at least a tenth, where
+compiling takes a moment. The figures are those of the compilations. Where it takes longer, a longer
+step is named if a twentieth of the lost cells or more keep their samples, and a tenth of these at
+most then does.
 """
 
 import json
@@ -18,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common.types import Statuses
+from lmdsl.common.types import Indices, Statuses
 from lmdsl.errors import BadInput
 from lmdsl.explanation import remedies
 from lmdsl.explanation.hints import Hint, hints
@@ -29,6 +31,8 @@ from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.systems import MatrixSystem
 
+# Share of the lost cells that keep their samples, and of these a longer step may leave so many.
+STUCK, LEFT = 0.05, 0.1
 GROWTH = (1, 2, 4)  # number of cells by which the attractor is tried to grow on every side
 
 
@@ -66,23 +70,41 @@ def _gain(share: float, then: float) -> str:
 def _longer_step(
     trial: MapTrial, status: Statuses, share: float, deadline: Deadline
 ) -> Iterator[Hint]:
-    better = remedies.better_step(trial.problem, share, deadline)
-    if better is None:
-        return
     cells = some(np.flatnonzero(np.isin(status, LOST)), trial.most_cells)
-    stuck = int(trial.stuck(cells).sum())
-    system: Any = better[0].system
-    step = float(f"{system.step:.12g}")
-    text = (
-        f'a longer step: with "step": {step!r}, "substeps": {json.dumps(system.substeps)}, '
-        f"{_gain(share, better[1])}; {stuck} of {len(cells)} lost cells tried keep all of their "
-        "samples under every control now"
+    stuck = cells[trial.stuck(cells)]
+    kept = (
+        f"{len(stuck)} of {len(cells)} lost cells tried keep all of their samples under every "
+        "control now"
     )
-    numbers = {
-        "step": step, "substeps": system.substeps, "share": share, "share_then": better[1],
-        "stuck": stuck, "tried": len(cells),
-    }  # fmt: skip
-    yield Hint("longer step", text, numbers)
+    numbers: dict[str, Any] = {"stuck": len(stuck), "tried": len(cells), "share": share}
+    better = remedies.better_step(trial.problem, share, deadline)
+    if better is not None:
+        longer, then = better
+        gain = f"{_gain(share, then)}; {kept}"
+        numbers["share_then"] = then
+    else:
+        freed = _freed(trial, stuck) if len(stuck) >= STUCK * len(cells) else None
+        if freed is None:
+            return
+        longer, left = freed
+        gain = f"{left or 'none'} of them do; {kept}"
+        numbers |= {"share_then": None, "stuck_then": left}
+    system: Any = longer.system
+    numbers |= {"step": float(f"{system.step:.12g}"), "substeps": system.substeps}
+    step = f'"step": {numbers["step"]!r}, "substeps": {json.dumps(system.substeps)}'
+    yield Hint("longer step", f"a longer step: with {step}, {gain}", numbers)
+
+
+def _freed(trial: MapTrial, stuck: Indices) -> tuple[Problem, int] | None:
+    """Return the shortest longer step that frees cells, where compiling would take too long."""
+    for factor in remedies.FACTORS:
+        longer = remedies.longer_step(trial.problem, factor)
+        if longer is None or (factor == 2 and remedies.cheap(longer, 2 * remedies.TRIAL)):
+            return None
+        left = int(MapTrial(longer, trial.partition).stuck(stuck).sum())
+        if left <= LEFT * len(stuck):
+            return longer, left
+    return None
 
 
 def _periodic(trial: MapTrial, share: float, deadline: Deadline) -> Iterator[Hint]:

@@ -9,6 +9,7 @@ import pytest
 from problems import made
 
 import lmdsl as lm
+from lmdsl.explanation import remedies
 
 PI = math.pi
 
@@ -55,6 +56,18 @@ def test_a_longer_step_frees_what_is_trapped():
     assert numbers["share_then"] > numbers["share"] + 0.1
     assert numbers["stuck"] > 0
     assert f'"step": {numbers["step"]!r}' in hint.text
+
+
+def test_a_longer_step_where_compiling_again_takes_too_long(monkeypatch):
+    monkeypatch.setattr(remedies, "TRIAL", 0.0)
+    problem = made(pendulum(0.002))
+    numbers = hints(problem)["longer step"].numbers
+    assert numbers["stuck"] > 0.05 * numbers["tried"]
+    assert numbers["share_then"] is None
+    assert numbers["stuck_then"] <= 0.1 * numbers["stuck"]
+    # Half of that step leaves more of them.
+    assert numbers["step"] > 0.004
+    assert "longer step" not in hints(made(pendulum()))
 
 
 def test_no_longer_step_where_the_step_is_long_enough():
