@@ -20,6 +20,7 @@ from lmdsl.model import discretization
 from lmdsl.model.assembly import estimates
 from lmdsl.model.assembly.sampler import Block, Sampler
 from lmdsl.model.assembly.transitions import Assembler, shares_of
+from lmdsl.model.grid.boxes import Ends
 from lmdsl.model.sets import CellSets
 from lmdsl.problem.problem import Problem
 
@@ -29,6 +30,7 @@ ALIKE = 0.1  # difference of the shares on two grids up to which the finer says 
 FUNCTION = 1e5  # additions for which a sample of a map counts of which nobody knows
 # Number of samples that are compiled to tell the time: of formulas, and of a user's own function.
 MOST_SAMPLES, FEW_SAMPLES = 2**20, 2**12
+GROWTH = (0, 1, 2, 4, 8)  # number of cells by which a box is tried to be larger than the attractor
 LEAST = 100  # number of free cells below which a share says little
 FALLEN = 0.9  # the part of a share below which it has fallen
 
@@ -200,8 +202,7 @@ def shrinking(problem: Problem, known: list[Level], deadline: Deadline) -> Itera
         f"stabilized the more cells there are: {told}"
     )
     figures: dict[str, Any] = {"shares": shares}
-    best = max(known, key=lambda one: one.found.share)
-    fixed = remedies.attractor_boxes(best.problem)
+    fixed = _box(max(known, key=lambda one: one.found.share).problem, last.problem, deadline)
     boxed = finest.problem.replaced(attractor={"boxes": fixed})
     share = remedies.coverage(boxed, deadline).share
     remedy = f'write "boxes": {json.dumps(fixed)} in attractor instead of points'
@@ -209,6 +210,20 @@ def shrinking(problem: Problem, known: list[Level], deadline: Deadline) -> Itera
         figures |= {"boxes": fixed, "share_with_boxes": share}
         remedy += f": then {100 * share:.3g} % on {shape(finest.cells)}"
     yield Finding("shrinking_attractor", "attractor.points", text, remedy, figures)
+
+
+def _box(source: Problem, on: Problem, deadline: Deadline) -> list[Ends]:
+    """Return the attractor of a problem as boxes, grown while much more can be stabilized so."""
+    found = []
+    for grow in GROWTH:
+        fixed = remedies.attractor_boxes(source, grow)
+        try:
+            boxed = on.replaced(attractor={"boxes": fixed})
+            found.append((fixed, remedies.coverage(boxed, deadline).share))
+        except BadInput:  # it meets avoid
+            break
+    best = max(share for _, share in found)
+    return next(fixed for fixed, share in found if share >= best - remedies.ABOUT)
 
 
 def nothing(known: list[Level], own: dict[str, int]) -> Iterator[Finding]:

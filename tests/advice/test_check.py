@@ -123,6 +123,17 @@ def test_an_attractor_of_points_that_shrinks_with_the_cells():
     assert share > 0.85
 
 
+def test_a_box_for_an_attractor_that_has_shrunk_already():
+    problem = lm.load("examples/double_integrator.json")
+    axes = {name: axis.replaced(cells=4 * axis.cells) for name, axis in problem.state_box.items()}
+    findings = {f.code: f for f in lm.check(problem.replaced(state_box=axes)).findings}
+    figures = findings["shrinking_attractor"].figures
+    assert figures["shares"]["320 x 240 cells"] == pytest.approx(0.30, abs=0.01)
+    assert figures["share_with_boxes"] > 0.85
+    # The map is a step of 0.15: it jumps over cells of 0.0125.
+    assert findings["long_step"].figures["widths_of_attractor"] > 1
+
+
 def test_points_do_not_matter_where_they_suffice():
     data = standard_map(20)
     assert "points" in data["attractor"]
