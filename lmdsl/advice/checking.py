@@ -72,6 +72,7 @@ def _of_the_map(survey: Survey, share: float | None, deadline: Deadline) -> Iter
     yield from declaration.unused(survey.problem)
     yield from declaration.angles(survey, share, deadline)
     yield from declaration.degrees(survey)
+    yield from motion.few_substeps(survey, deadline)
     yield from motion.on_edges(survey)
     yield from motion.short_step(survey, share, deadline)
     yield from motion.long_step(survey, share)

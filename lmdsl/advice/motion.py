@@ -11,6 +11,7 @@ from lmdsl.advice.survey import Survey
 from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.explanation import remedies
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.assembly.substeps import integration_error, settled
 from lmdsl.model.grid.partition import MAX_CELLS, Partition
 
 STUCK = 0.05  # share of cells tried that keep their samples from which on a step is too short
@@ -124,6 +125,30 @@ def _json(data: Any) -> str:
 
 def _cells(cells: dict[str, int]) -> str:
     return ", ".join(f'"cells": {count} for {name}' for name, count in cells.items())
+
+
+def few_substeps(survey: Survey, deadline: Deadline) -> Iterator[Finding]:
+    """Find that the Runge-Kutta steps miss the differential equation, and how many do not."""
+    if survey.sets is None:
+        return
+    error = integration_error(survey.problem, survey.sets.free, deadline)
+    if error is None or not error.excessive:
+        return
+    system: Any = survey.problem.system
+    auto = survey.problem.replaced(system=system.replaced(substeps="auto"))
+    needed: Any = settled(auto, deadline).system
+    missed = max(error.halving or 0.0, error.accurate or 0.0)
+    text = (
+        f"with {_count(error.substeps, 'substep')} the steps are up to {missed:.2g} widths of a "
+        "cell from the differential equation (99 % quantile), so that the answer is not about it"
+    )
+    remedy = f'write "substeps": "auto" in system, which makes them {needed.substeps}'
+    figures = {"substeps": error.substeps, "widths": missed, "substeps_needed": needed.substeps}
+    yield Finding("few_substeps", "system.substeps", text, remedy, figures)
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def on_edges(survey: Survey) -> Iterator[Finding]:

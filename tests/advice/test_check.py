@@ -100,6 +100,16 @@ def test_jumping_does_not_matter_where_the_path_is_judged():
             assert '"judged": "path"' in report["long_step"].remedy
 
 
+def test_steps_that_miss_the_equation():
+    problem = lm.load("examples/van_der_pol.json")
+    coarse = problem.replaced(system={"kind": "van_der_pol", "step": 0.4, "substeps": 1})
+    findings = {finding.code: finding for finding in lm.check(coarse).findings}
+    figures = findings["few_substeps"].figures
+    assert figures["widths"] > 1
+    enough = coarse.system.replaced(substeps=figures["substeps_needed"])
+    assert "few_substeps" not in {f.code for f in lm.check(coarse.replaced(system=enough)).findings}
+
+
 # Attractors ------------------------------------------------------------------------------------
 
 
