@@ -184,6 +184,16 @@ def test_costs_that_are_refused(more, words):
         lm.compile(lm.Problem(**data))
 
 
+def test_a_negative_cost_is_refused_whatever_else_is_paid():
+    """Neither a stage cost nor a terminal cost makes up for a negative part."""
+    for judged in ("path", "endpoint"):
+        with pytest.raises(lm.BadInput, match="terminal_cost: the terminal cost is -"):
+            lm.compile(lm.Problem(**drive(judged, stage_cost="1000", terminal_cost="x - 19")))
+    box = {"boxes": [{"x": [0, 0.4]}]}
+    with pytest.raises(lm.BadInput, match="cost_rate: the cost rate is -"):
+        lm.compile(decay(cost_rate="x - 0.6", attractor=box, terminal_cost="1000"))
+
+
 def test_a_map_has_no_rate():
     data = drive(cost_rate="1")
     del data["stage_cost"]

@@ -11,7 +11,7 @@ from command_line import run
 from problems import made, steps
 
 import lmdsl as lm
-from lmdsl.model.assembly.substeps import integration_error, settled
+from lmdsl.model.assembly.substeps import IntegrationError, integration_error, settled
 
 
 def decay(rate=-3.0, substeps=1, step=0.4, **more):
@@ -98,6 +98,12 @@ def test_a_warning_above_a_tenth_of_a_cell(tmp_path, capsys):
         "the steps are more than a tenth of a cell from the equation: raise substeps, or write"
     )
     assert said.count(warning) == 2  # in the report, and in the message
+
+
+def test_the_remedy_where_no_more_substeps_are_to_be_had():
+    text = str(IntegrationError(512, 100, 1.0, 1.0))
+    assert "shorten step" in text and "raise substeps" not in text
+    assert 'raise substeps, or write "auto"' in str(IntegrationError(500, 100, 1.0, 1.0))
 
 
 def test_kinks_are_judged_by_finer_fixed_steps():

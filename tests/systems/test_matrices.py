@@ -220,6 +220,8 @@ def test_keys_of_a_problem_apply():
     more = problem.replaced(stage_cost="state + 10*action", terminal_cost="state*4", gamma=0.5)
     # V1 = 1 + 1 + 0.5*8, V0 = 1 + 0 + 0.5 V1
     assert lm.solve(more).value.tolist() == pytest.approx([4, 6, 0])
+    with pytest.raises(lm.BadInput, match="is not finite and >= 0"):
+        lm.compile(problem.replaced(terminal_cost="-0.5"))  # whatever else is paid
     other = problem.replaced(admissible="state > 0 or action == 1")
     assert lm.solve(other).value.tolist() == pytest.approx([5, 1, 0])
     unsafe = lm.from_matrices(P, np.array([[1, 5], [1, 5], [0, 0]]), [2], avoid=[1])

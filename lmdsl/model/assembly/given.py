@@ -90,7 +90,8 @@ def _cost(
     if terminal is not None:
         centres = partition.centres(given.target[entered].astype(np.int64))
         states = dict(zip(problem.states, centres.T, strict=True))
-        paid += Program([terminal], problem.system.constants())(states)[0]
+        (end,) = Program([terminal], problem.system.constants())(states)
+        paid += np.where(end < 0, np.nan, end)  # no other cost may hide it
     if paid.any():
         paid *= problem.gamma * (1.0 if problem.discount is None else problem.discount)
         paid *= given.values()[given.code[entered]]

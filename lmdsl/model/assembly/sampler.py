@@ -163,7 +163,7 @@ class Sampler:
         values, shape = self.values(block), self._shape(block)
         if self._entries is not None:
             ends = self._entries.ends(values, self._step, shape, self.guard)
-            cost = self._mean(sum(self._by_key(values, ends).values(), np.zeros(())))
+            cost = self._mean(_together(self._by_key(values, ends)))
             return self._samples_together(self._admitted_only(values, ends.cell)), cost
         index = mean = None
         axes, clip, weights = self.partition.axes, self.partition.clip, self.nodes.weights
@@ -215,7 +215,7 @@ class Sampler:
 
         The shape is (first, last), with 1 for an axis on which the cost does not depend.
         """
-        return self._mean(sum(self.costs_by_key(block, values).values(), np.zeros(())))
+        return self._mean(_together(self.costs_by_key(block, values)))
 
     def costs_by_key(self, block: Block, values: Mapping[str, Floats]) -> dict[str, Floats]:
         """Return what samples cost, by key of the problem, in shapes that broadcast to theirs."""
@@ -253,6 +253,15 @@ class Sampler:
         mean = np.zeros((cost.shape[0], cost.shape[3]))
         mean_cost(fixed(cost), len(self.points), self.nodes.weights, mean, mean.copy())
         return mean
+
+
+def _together(costs: Mapping[str, Floats]) -> Floats:
+    """Return what samples pay in all, NaN where a part is negative: another may not hide it."""
+    total: Floats = sum(costs.values(), np.zeros(()))
+    if len(costs) > 1:
+        for part in costs.values():
+            total = np.where(part < 0, np.nan, total)
+    return total
 
 
 def chunk(problem: Problem) -> int:

@@ -58,7 +58,9 @@ class IntegrationError(Reported):
     def warning(self) -> str:
         """Return what to do about an excessive error; empty where it is not."""
         much = "the steps are more than a tenth of a cell from the equation"
-        return f'{much}: raise substeps, or write "auto"' if self.excessive else ""
+        more = 2 * self.substeps <= MOST
+        remedy = 'raise substeps, or write "auto"' if more else "shorten step, or use larger cells"
+        return f"{much}: {remedy}" if self.excessive else ""
 
     def sentence(self) -> str:
         """Return one line for people."""
