@@ -112,7 +112,8 @@ class Parser:
         if text == "(" and self.text[start + 1 :].lstrip(" \t").startswith("mod "):
             raise fault_at(start, "(mod ...) is no formula; declare the axis periodic instead")
         if (kind != "symbol" or text == "(") and expected.startswith("an operator"):
-            fault = f"an operator is missing before {shown(text)}; write * for a product"
+            fix = text.lower() if text.lower() in ("and", "or") else "* for a product"
+            fault = f"an operator is missing before {shown(text)}; write {fix}"
             raise fault_at(start, fault)
         fix = "; put the condition in brackets" if text == "not" and expected == _OPERAND else ""
         raise fault_at(start, f"{shown(text)} stands where {expected} is expected{fix}")

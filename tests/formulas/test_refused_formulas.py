@@ -73,6 +73,7 @@ HOSTILE = [
     ("where((not x<1) + 1,1,2)", 7, "comparison"), ("where(x < not y<1,1,2)", 10, "brackets"),
     ("where(1/0>0 and x<1,1,2)", 6, "'1/0'"), ("where(x<1 or 2,1,2)", 13, "'2' is not"),
     ("where(x<1 && y<1,1,2)", 10, "'&&'.*write and"), ("where(x<1 || y<1,1,2)", 10, "write or"),
+    ("where(x<1 AND y<1,1,2)", 10, "write and"), ("where(x<1 Or y<1,1,2)", 10, "write or"),
     ("where(!(x<1),1,2)", 6, "write not"), ("where(x=1,1,2)", 7, "write == to"),
     ("mod", 0, "function"), ("mod(x)", 0, "2 arguments"), ("mod(1, 0)", 0, "not a number"),
     ("mod x", 0, "function"), ("x + y (mod 1)", 6, "declare the axis periodic"),
