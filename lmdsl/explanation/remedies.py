@@ -151,7 +151,8 @@ def hidden_periods(trial: MapTrial) -> Iterator[tuple[int, float]]:
 def repeats(trial: MapTrial, axis: int, period: float) -> bool:
     """Return whether the map has a period along an axis, and is not the same everywhere along it.
 
-    Images may move by whole turns of a circle, and along the axis by whole periods.
+    Images may move by whole turns of a circle, and along the axis by whole periods. Where the image
+    along the axis is straight (3 x + u: whole periods go to whole periods), that is no circle.
     """
     p = trial.partition
     cells = np.unique(np.random.default_rng(0).integers(p.size, size=PLACES))
@@ -165,16 +166,17 @@ def repeats(trial: MapTrial, axis: int, period: float) -> bool:
 
     with np.errstate(all="ignore"):
         here = trial.images(state, vectors)
-        for j, x in enumerate(moved(period)):
+        turned = moved(period)
+        for j, x in enumerate(turned):
             circle = period if j == axis else float(trial.span[j])
             if j == axis or p.periodic[j]:
                 x = x - np.round(x / circle) * circle
             if not np.abs(x).max() <= SAME * trial.span[j]:
                 return False
-        for by in (part * period for part in ASIDE):
-            for j, x in enumerate(moved(by)):
-                if j == axis:  # a constant image is no sign of a circle either
-                    x = np.minimum(np.abs(x), np.abs(x + by))
+        for part in ASIDE:
+            for j, x in enumerate(moved(part * period)):
+                if j == axis:
+                    x = x - part * turned[j]
                 if np.abs(x).max() >= DIFFERENT * trial.span[j]:
                     return True
     return False

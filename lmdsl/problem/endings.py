@@ -30,6 +30,20 @@ def require_end(problem: "Problem") -> None:
         raise BadInput("there is no attractor cell to control; leave it out", "local_controller")
 
 
+def require_same_data(before: "Problem", after: "Problem") -> None:
+    """Refuse to change of recorded data what their rows and costs were made with."""
+    old, new = before.system, after.system
+    if not (isinstance(old, DataSystem) and isinstance(new, DataSystem) and old.rows is new.rows):
+        return
+    for key in ("state_box", "control_grid", "stage_cost", "cost_rate"):
+        if getattr(after, key) != getattr(before, key):
+            raise BadInput(
+                "the rows and costs of recorded data were made with another one; call "
+                "lmdsl.from_data again",
+                key,
+            )
+
+
 def require_fit(problem: "Problem") -> None:
     """Refuse what a finite model has no place for."""
     system = problem.system

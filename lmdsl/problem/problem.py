@@ -256,6 +256,12 @@ class Problem(Declared):
             for i, text in enumerate(texts)
         )
 
+    def replaced(self, **changes: Any) -> Self:
+        """Return a copy with some keys changed, validated anew."""
+        changed = super().replaced(**changes)
+        endings.require_same_data(self, changed)
+        return changed
+
     def __eq__(self, other: object) -> bool:
         """Compare all keys, and the order of axes and controls: it numbers cells and vectors."""
         if not isinstance(other, Problem):

@@ -4,6 +4,7 @@ The function is the user's: it gets copies that it cannot write to, its images a
 arrays of doubles, and before and after a compilation it is asked the same question several ways.
 """
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, Self
 
@@ -77,7 +78,24 @@ class FunctionSystem(System):
         definitions: Definitions = NO_DEFINITIONS,
     ) -> StateMap:
         """See :meth:`System.compile`."""
+        _require_called(self.next, (*states, *controls, *noise, *self.parameters))
         results = Returned(tuple(states), WHERE)
         if self.vectorized:
             return FunctionMap(self.next, results, self.parameters)
         return ScalarMap(self.next, results, self.parameters, processes=self.processes)
+
+
+def _require_called(function: Callable[..., Any], names: Sequence[str]) -> None:
+    """Refuse a function that cannot be called with all values by name."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return  # that of many built-in functions is not known
+    try:
+        signature.bind(**dict.fromkeys(names))
+    except TypeError as error:
+        raise BadInput(
+            f"the function is called with {', '.join(names)} by name, and its arguments "
+            f"{signature} do not fit: {error}",
+            WHERE,
+        ) from None

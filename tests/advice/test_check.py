@@ -42,6 +42,14 @@ def test_larger_shipped_problems_look_right(name):
     assert not lm.check(lm.load(f"examples/{name}.json"))
 
 
+def test_a_cost_that_is_none_on_finer_cells_only():
+    """Twice the cells have samples nearer to 0, where the cost is negative: they are not tried."""
+    data = shift(low=-1, high=1, cells=20, stage_cost="abs(x) - 0.03")
+    data["attractor"] = {"boxes": [{"x": [0.5, 0.7]}]}
+    data["sampling"] = {"kind": "grid", "per_axis": 1}
+    assert lm.check(made(data)).expected.coverage is not None
+
+
 # Steps -----------------------------------------------------------------------------------------
 
 

@@ -63,6 +63,7 @@ def test_an_angle_of_about_a_turn(low, high):
         ("x + 0.1*u", (0, 1)),  # moved along with the state: no circle
         ("0.5*x + 0.1*u", (0, 1)),
         ("0.5", (0, 1)),
+        ("3*x + 0.1*u", (0, 1)),  # unstable and straight: whole lengths go to whole lengths
         ("where(x < 1, 0.2, 0.7)", (0, 1)),  # images that do not depend on where outside
         ("x + 0.1*sin(2*pi*x) + 0.1*u", (0, 0.9)),  # not the whole circle
         ("x + 0.1*sin(pi*x) + 0.1*u", (0, 1)),  # half of it
@@ -97,3 +98,9 @@ def test_images_that_lie_on_edges():
 def test_images_at_the_ends_of_an_axis_are_no_accident():
     data = shift("9*u", on_exit="clip")
     assert "on_edges" not in found(data)
+
+
+def test_a_doubling_circle():
+    data = shift(low=0, high=1, attractor={"points": [[0.5]]})
+    data["system"]["next"]["x"] = "mod(2*x + 0.1*u, 1)"
+    assert found(data)["not_periodic"].figures["period"] == 1

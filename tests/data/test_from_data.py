@@ -33,6 +33,18 @@ def test_a_chain_by_hand():
     assert result.lp.rows.total(0) == 4
 
 
+def test_what_rows_were_made_with_is_not_changed_beside_them():
+    problem = lm.from_data([0.6], [0], [0.1], **KEYS)
+    for key, value in {
+        "stage_cost": "2*x",
+        "control_grid": {"u": {"values": [-2, 0, 2]}},
+        "state_box": {"x": {"low": 0, "high": 4, "cells": 4}},
+    }.items():
+        with pytest.raises(lm.BadInput, match=rf"{key}: .* call lmdsl.from_data again"):
+            problem.replaced(**{key: value})
+    assert problem.replaced(gamma=0.5, stage_cost="x + u**2").gamma == 0.5
+
+
 def test_a_pair_that_was_seen_to_leave_is_inadmissible():
     away = lm.from_data([0.6] * 9, [0] * 9, [0.1] * 8 + [2.5], **KEYS)
     assert lm.solve(away).status == "not_stabilizable"

@@ -59,7 +59,8 @@ def assemble(
     finite at a sample.
     """
     require_least(problem)
-    deadline = unless_short(problem, Deadline.of(deadline))
+    # Its own: it is cancelled below, and who asked may go on with another problem.
+    deadline = Deadline(unless_short(problem, Deadline.of(deadline)).left)
     sets = CellSets.of(problem, partition, deadline)
     if isinstance(problem.system, MatrixSystem):
         from lmdsl.model.assembly.given import of_matrices  # which makes what stands here

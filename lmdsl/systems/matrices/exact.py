@@ -91,7 +91,11 @@ def _judged(
     for r in off.tolist():
         x, where = Fraction(int(sums[r]), int(total[r])), listing.name(filled[r])
         if x > 1:
-            raise BadInput(f"{where}: the probabilities sum to {_shown(x)}, more than 1", "P")
+            raise BadInput(
+                f"{where}: the probabilities sum to {_shown(x)}, more than 1; divide every row by "
+                "its sum, in double precision",
+                "P",
+            )
         if 1 - x <= NEAR:
             raise BadInput(
                 f"{where}: the fractions sum to {x}, not to 1; exact ones have to sum to "
