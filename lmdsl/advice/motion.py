@@ -46,6 +46,8 @@ def short_step(survey: Survey, share: float | None, deadline: Deadline) -> Itera
     parts = [*_longer(survey, cells, share, figures, deadline)]
     if many:
         parts += _other_cells(survey, cells, moved, figures, bool(parts))
+    if not parts and many:
+        parts += _much_longer(survey, moved, figures)
     if not parts:
         return  # the map itself stays, or a longer step helps nothing
     text = (
@@ -80,6 +82,21 @@ def _longer(
             figures |= _step(problem.system) | {"left": left}
             yield f"write {_json(_step(problem.system))} in system: then {_left(left, len(cells))}"
             return
+
+
+def _much_longer(survey: Survey, moved: float, figures: dict[str, Any]) -> Iterator[str]:
+    """Yield about how much longer a step must be that is far too short for all that was tried."""
+    if not 0 < moved < 1 / remedies.FACTORS[-1]:
+        return
+    if remedies.longer_step(survey.problem, 1) is None:
+        yield f"let the system be about {1 / moved:.2g} steps of its map at once"
+        return
+    system: Any = survey.problem.system
+    figures["step"] = float(f"{system.step / moved:.2g}")
+    yield (
+        f'write "step": {figures["step"]!r} in system, about {1 / moved:.2g} times as long: then '
+        "that sample moves by about a width"
+    )
 
 
 def _step(system: Any) -> dict[str, Any]:

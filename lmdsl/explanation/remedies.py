@@ -53,6 +53,8 @@ class StabilizableShare(NamedTuple):
 
 def coverage(problem: Problem, deadline: Deadline | None = None) -> StabilizableShare:
     """Return how much of a problem can be stabilized."""
+    # A deadline of its own: a fault cancels it, and who asks goes on with other problems.
+    deadline = None if deadline is None else Deadline(deadline.left)
     problem = settled(problem, deadline)
     transitions = assemble(problem, Partition.of(problem), deadline=deadline)
     found = stabilizable_set.of_problem(problem, transitions, deadline)

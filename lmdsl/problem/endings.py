@@ -35,7 +35,7 @@ def require_same_data(before: "Problem", after: "Problem") -> None:
     old, new = before.system, after.system
     if not (isinstance(old, DataSystem) and isinstance(new, DataSystem) and old.rows is new.rows):
         return
-    for key in ("state_box", "control_grid", "stage_cost", "cost_rate"):
+    for key in ("state_box", "control_grid", "stage_cost", "cost_rate", "on_exit"):
         if getattr(after, key) != getattr(before, key):
             raise BadInput(
                 "the rows and costs of recorded data were made with another one; call "

@@ -42,9 +42,24 @@ def test_larger_shipped_problems_look_right(name):
     assert not lm.check(lm.load(f"examples/{name}.json"))
 
 
+def test_a_step_that_is_too_short_for_all_that_is_tried():
+    data = shift(low=-1, high=1, cells=20, controls=(-0.1, 0, 0.1), per_axis=3)
+    data["attractor"] = {"boxes": [{"x": [-0.1, 0.1]}]}
+    data["system"] = {"kind": "ode", "derivative": {"x": "-x + u"}, "step": 0.0005}
+    finding = found(data)["short_step"]
+    assert finding.where == "system.step"
+    assert finding.figures["step"] == pytest.approx(0.1 / 0.65, rel=0.3)  # a width at mean speed
+    data["system"]["step"] = finding.figures["step"]
+    assert lm.solve(made(data)).coverage.share == 1
+    data["system"] = {"kind": "map", "next": {"x": "x + 0.0001*u"}}
+    assert "steps of its map at once" in found(data)["short_step"].remedy
+    data["system"] = {"kind": "map", "next": {"x": "x + 0*u"}}
+    assert "short_step" not in found(data)
+
+
 def test_a_cost_that_is_none_on_finer_cells_only():
     """Twice the cells have samples nearer to 0, where the cost is negative: they are not tried."""
-    data = shift(low=-1, high=1, cells=20, stage_cost="abs(x) - 0.03")
+    data = shift(low=-1, high=1, cells=20, stage_cost=lambda x: np.abs(x) - 0.03)
     data["attractor"] = {"boxes": [{"x": [0.5, 0.7]}]}
     data["sampling"] = {"kind": "grid", "per_axis": 1}
     assert lm.check(made(data)).expected.coverage is not None

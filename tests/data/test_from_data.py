@@ -37,6 +37,7 @@ def test_what_rows_were_made_with_is_not_changed_beside_them():
     problem = lm.from_data([0.6], [0], [0.1], **KEYS)
     for key, value in {
         "stage_cost": "2*x",
+        "on_exit": "clip",
         "control_grid": {"u": {"values": [-2, 0, 2]}},
         "state_box": {"x": {"low": 0, "high": 4, "cells": 4}},
     }.items():

@@ -310,3 +310,19 @@ def test_the_whole_chain_with_noise_local_controller_and_runs(tmp_path):
     mine.save(tmp_path / "out")
     with pytest.raises(lm.BadInput):
         lm.Result.load(tmp_path / "out").simulate(starts=10)
+
+
+@pytest.mark.parametrize("vectorized", [True, False])
+@pytest.mark.parametrize(
+    "function", [lambda y, u: y, lambda x: x, lambda x, u, more: x, lambda x, u, /: x]
+)
+def test_arguments_that_do_not_fit_are_named(function, vectorized):
+    with pytest.raises(lm.BadInput, match=r"system.next: .* called with x, u by name"):
+        lm.Problem(
+            system=lm.systems.FunctionSystem(next=function, vectorized=vectorized),
+            state_box={"x": {"low": 0, "high": 1, "cells": 4}},
+            attractor={"boxes": [{"x": [0, 0.25]}]},
+            control_grid={"u": {"values": [0]}},
+            stage_cost="1",
+            sampling={"kind": "grid", "per_axis": 1},
+        )

@@ -82,7 +82,9 @@ def test_rows_below_one_escape_and_above_are_refused():
     assert "every action may escape or enter avoid" in str(lm.explain(problem))
     assert "true map" not in str(lm.explain(problem))
     for row in ([0.5, 0.6], [THIRD, 1]):
-        with pytest.raises(lm.BadInput, match=r"^P: state 0, action 0: .* more than 1$"):
+        with pytest.raises(
+            lm.BadInput, match=r"^P: state 0, action 0: .* more than 1; divide every row"
+        ):
             lm.from_matrices([row, [0, 1]], [1, 1], [1])
     with pytest.raises(lm.BadInput, match="sum to exactly 1"):
         lm.from_matrices([[THIRD, Fraction("0.6666666666")], [0, 1]], [1, 1], [1])

@@ -397,19 +397,3 @@ def test_an_interrupt_of_a_call_is_passed_on():
 
     with pytest.raises(KeyboardInterrupt):
         lm.solve(problem(interrupted))
-
-
-@pytest.mark.parametrize("vectorized", [True, False])
-@pytest.mark.parametrize(
-    "function", [lambda y, u: y, lambda x: x, lambda x, u, more: x, lambda x, u, /: x]
-)
-def test_arguments_that_do_not_fit_are_named(function, vectorized):
-    with pytest.raises(lm.BadInput, match=r"system.next: .* called with x, u by name"):
-        lm.Problem(
-            system=lm.systems.FunctionSystem(next=function, vectorized=vectorized),
-            state_box={"x": {"low": 0, "high": 1, "cells": 4}},
-            attractor={"boxes": [{"x": [0, 0.25]}]},
-            control_grid={"u": {"values": [0]}},
-            stage_cost="1",
-            sampling={"kind": "grid", "per_axis": 1},
-        )

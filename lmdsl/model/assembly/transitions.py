@@ -59,8 +59,7 @@ def assemble(
     finite at a sample.
     """
     require_least(problem)
-    # Its own: it is cancelled below, and who asked may go on with another problem.
-    deadline = Deadline(unless_short(problem, Deadline.of(deadline)).left)
+    deadline = unless_short(problem, Deadline.of(deadline))
     sets = CellSets.of(problem, partition, deadline)
     if isinstance(problem.system, MatrixSystem):
         from lmdsl.model.assembly.given import of_matrices  # which makes what stands here
