@@ -153,6 +153,8 @@ def verify(
         notes.insert(0, NOT_EVALUATED[functions])
         if "system" in functions and result.local_controller is not None:
             notes.append("what the local controller does was not checked")
+        if "system" in functions and result.problem.terminal_cost is not None:
+            notes.append("the terminal cost was not checked: it is paid at images of the function")
         if (result.cell_status == CellStatus.BEYOND_GAMMA).any():
             notes.append("that gamma is infeasible from the cells left out was not checked")
     lp = _restricted(lp, result, reasons, judge)

@@ -6,7 +6,7 @@ import copy
 import hashlib
 import json
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from saved_results import put, refused
 
 import lmdsl as lm
 from lmdsl.cli import main
-from lmdsl.results.directory import reading
+from lmdsl.results.directory import audit, reading
 from lmdsl.results.directory.certificate_file import CertificateFile
 from lmdsl.results.summary import Summary
 from lmdsl.systems import FunctionSystem
@@ -298,6 +298,26 @@ def test_a_function_saved_by_an_earlier_version_holds(tmp_path):
     put(tmp_path / "out", {**stored, "model_sha256": result.lp.digest})
     found = lm.verify(tmp_path / "out")
     assert (found.holds, found.same_model) == (True, True)
+
+
+@pytest.mark.parametrize("discount", [None, 0.97])
+def test_a_terminal_cost_of_a_function(tmp_path, discount):
+    """It is paid at images that are not at hand: what can be known of the costs is checked."""
+    problem = function().replaced(terminal_cost="2 + x", discount=discount)
+    result, out = lm.solve(problem), tmp_path / "out"
+    result.save(out)
+    found = lm.verify(out)
+    assert found.holds
+    assert "the terminal cost was not checked" in found.notes[1]
+    cost, entering = result.lp.cost, audit._entering(result.lp)
+    assert 0 < entering.sum() < len(entering)
+    for k in range(len(cost)):
+        for more in (0.5, -3):
+            changed = cost.copy()
+            changed[k] += more
+            text = str(audit.function_differences(replace(result.lp, cost=changed), result))
+            unseen = entering[k] and more > 0
+            assert ("is not the stage cost" in text) != unseen
 
 
 @pytest.mark.parametrize("name", ["pair_pointer", "control", "pointer", "target", "code", "cost"])
