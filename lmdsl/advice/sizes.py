@@ -16,11 +16,12 @@ from lmdsl.explanation.remedies import StabilizableShare
 from lmdsl.explanation.trials import some
 from lmdsl.machine import memory, threads
 from lmdsl.machine.deadline import Deadline
-from lmdsl.model import discretization
+from lmdsl.model import discretization, stabilizable_set
 from lmdsl.model.assembly import estimates
 from lmdsl.model.assembly.sampler import Block, Sampler
-from lmdsl.model.assembly.transitions import Assembler, shares_of
+from lmdsl.model.assembly.transitions import Assembler, assemble, shares_of
 from lmdsl.model.grid.boxes import Ends
+from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.problem.problem import Problem
 
@@ -118,13 +119,16 @@ def of_matrices(problem: Problem, deadline: Deadline) -> tuple[Level, Expectatio
     """Compile a finite model: there is no map to try."""
     cells = {name: axis.cells for name, axis in problem.state_box.items()}
     start = time.perf_counter()
-    covered = remedies.coverage(problem, deadline)
+    transitions = assemble(problem, Partition.of(problem), deadline=deadline)
+    inside = stabilizable_set.of_problem(problem, transitions, deadline).inside
+    covered = remedies.StabilizableShare(int(inside.sum()), len(inside))
     level = Level(problem, cells, covered, time.perf_counter() - start)
+    pairs = len(inside) * discretization.control_count(problem)
     return level, Expectation(
         cells=math.prod(cells.values()),
         controls=discretization.control_count(problem),
         samples=1,
-        admissible=1.0,
+        admissible=int(transitions.pair_pointer[-1]) / max(pairs, 1),
         coverage=covered.share if covered.free else None,
         coverage_cells=cells,
         memory=estimates.estimate(problem),

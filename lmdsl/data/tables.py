@@ -5,6 +5,7 @@ says of itself before anything is unpacked.
 """
 
 import io
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -93,11 +94,15 @@ def _csv(file: BinaryIO) -> dict[str, NDArray[Any]]:
     _few(len(names))
     if not all(names) or len(set(names)) < len(names):
         raise BadInput("names in its first line are empty or stand twice; name every column once")
+    if len(names) == 1 and any(separator in names[0] for separator in ";\t"):
+        raise BadInput("its columns are not separated by commas; write x,u,x_next and 0.5,0,0.1")
     if any(_is_number(name) for name in names):
         raise BadInput("its first line holds numbers; write the names of the columns there")
     text = io.TextIOWrapper(file, encoding="utf-8", errors="strict")
     try:
-        table = np.loadtxt(text, delimiter=",", ndmin=2, comments=None)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a file without transitions
+            table = np.loadtxt(text, delimiter=",", ndmin=2, comments=None)
     except UnicodeDecodeError:
         raise BadInput("it is no UTF-8 text") from None
     except ValueError as error:

@@ -88,6 +88,8 @@ def from_matrices(
     >>> lm.solve(problem).value.tolist()[1]
     0.0
     """
+    if not isinstance(maximise, bool | np.bool_):
+        raise BadInput(f"{shown(maximise)} is not accepted; write True or False", "maximise")
     chosen = layout_of(P, layout)
     listing, found = _read(P, cost, chosen)
     listing = listing.ordered()
@@ -150,6 +152,8 @@ def _states(given: Any, where: str, count: int, found: Explicit | None) -> Bools
         array = np.asarray(labelled(found, array.tolist()), dtype=np.int64)
     if not array.size:
         return mask
+    if array.ndim == 0 and array.dtype.kind in "iu":
+        raise BadInput(f"{int(array)} stands for one; write a list of them, [{int(array)}]", where)
     if array.ndim != 1 or array.dtype.kind not in "iu":
         raise BadInput(f"{shown(given)} are no states; give their numbers", where)
     if array.min() < 0 or array.max() >= count:

@@ -33,6 +33,12 @@ def test_a_chain_by_hand():
     assert result.lp.rows.total(0) == 4
 
 
+def test_check_counts_the_pairs_that_were_recorded():
+    """Two of nine pairs of the three free cells stay, the third was seen to leave."""
+    problem = lm.from_data([0.6, 1.1, 1.6], [0, 1, 1], [0.1, 0.7, 2.5], **KEYS)
+    assert lm.check(problem).expected.admissible == pytest.approx(2 / 9)
+
+
 def test_what_rows_were_made_with_is_not_changed_beside_them():
     problem = lm.from_data([0.6], [0], [0.1], **KEYS)
     for key, value in {

@@ -103,6 +103,8 @@ def archive(**members):
         ("a.csv", b"0.6,-1,0.1\n", "first line holds numbers"),
         ("a.csv", b"x,x,u\n1,2,3\n", "stand twice"),
         ("a.csv", b"x,u\n1,2\n1,two\n", "two"),
+        ("a.csv", b"x;u\n1;2\n", "not separated by commas"),
+        ("a.csv", b"x\tu\n1\t2\n", "not separated by commas"),
         ("a.csv", b"x,u\n1,2\n1,2,3\n", "columns changed|number of columns"),
         ("a.csv", b"x,u,v\n1,2\n", "3 names for 2 columns"),
         ("a.csv", b"\xff\xfe\n1\n", "no UTF-8"),
@@ -157,3 +159,9 @@ def test_parquet_without_its_package_names_the_extra(tmp_path, monkeypatch):
     (tmp_path / "a.parquet").write_bytes(b"PAR1")
     with pytest.raises(lm.BadInput, match=r"pip install 'lmdsl\[data\]'"):
         lm.read_data(tmp_path / "a.parquet")
+
+
+def test_a_table_without_transitions(tmp_path, recwarn):
+    (tmp_path / "a.csv").write_bytes(b"x,u,x_next\n")
+    assert lm.from_data(tmp_path / "a.csv", **KEYS).system.recorded.transitions == 0
+    assert not recwarn.list

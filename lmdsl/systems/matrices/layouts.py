@@ -242,6 +242,8 @@ def coordinates(x: Any, where: str) -> tuple[tuple[int, int], Indices, Indices, 
 
 def numbers(x: Any, where: str) -> NDArray[Any]:
     """Return an array of doubles; of Fractions where all numbers were given exactly."""
+    if isinstance(x, np.ma.MaskedArray) and np.ma.is_masked(x):
+        raise BadInput("the numbers are masked in places; fill them", where)
     try:
         array = np.asarray(x)
     except ValueError as error:
