@@ -19,20 +19,24 @@ more controls  for cells that escape: along one control, with the others held at
 A hint is given if at least 5 % of the cells tried support it, and carries its numbers.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from lmdsl.common.records import Reported
-from lmdsl.common.types import Bools, Floats, Indices, Statuses
+from lmdsl.common.types import Bools, Floats, Guard, Indices, Statuses
 from lmdsl.explanation.trials import MOST_CONTROLS, MapTrial, some
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.assembly.paths.judging import PathJudge
 from lmdsl.model.discretization import control_values
 from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.problem.problem import Problem
+from lmdsl.systems.runge_kutta import RungeKutta
 
 # Steps of a run; share of the axis above which a side is left too far; share of cells below which a
 # hint has no support; share of them for which its numbers suffice.
@@ -72,7 +76,7 @@ def hints(
     if not lost.any():
         return ()
     trial = _Trial(problem, partition, deadline, "trying what helps")
-    trial.status = status
+    trial.status, trial.way = status, _Way.of(problem, partition)
     escaping = np.flatnonzero(status == CellStatus.ESCAPES)
     with np.errstate(all="ignore"):
         found = _by_runs(trial, some(np.flatnonzero(lost), trial.most_cells))
@@ -85,6 +89,7 @@ class _Trial(MapTrial):
     """The true map, and what becomes of its images."""
 
     status: Statuses  # of all cells
+    way: "_Way | None"  # judges paths; None where there are none
 
     def step(
         self, state: list[Floats], controls: list[Floats], shape: tuple[int, ...]
@@ -92,7 +97,13 @@ class _Trial(MapTrial):
         """Return images per axis, overshoot (2 d, *shape) by side, and status (-1 outside)."""
         p = self.partition
         images, over = [], np.zeros((2 * p.dimension, *shape))
-        found = self.images(state, controls)
+        left: Bools | None = None
+        found: tuple[Floats, ...]
+        if self.way is None:
+            found = self.images(state, controls)
+        else:
+            values = self.true_map.named(state, controls, self.noise)
+            found, left = self.way(values, shape, self.guard)
         for k, (axis, image) in enumerate(zip(p.axes, found, strict=True)):
             x = axis.state(np.broadcast_to(image, shape), p.clip)
             if not (axis.periodic or p.clip):
@@ -106,6 +117,8 @@ class _Trial(MapTrial):
         code = np.where(flat >= 0, self.status[flat].astype(np.int64), -1)
         admitted = self.admits(state, controls)
         fine = finite if admitted is None else finite & admitted
+        if left is not None:  # and came back: by no side that a larger box would tell
+            fine = fine & ~(left & (over == 0).all(axis=0))
         return images, over, np.where(fine, code, np.int64(CellStatus.AVOID))
 
     def side(self, number: int) -> tuple[str, str, float, float]:
@@ -114,6 +127,29 @@ class _Trial(MapTrial):
         p = self.partition
         place = float(p.high[k] if high else p.low[k])
         return p.names[k], "high" if high else "low", place, float(self.span[k])
+
+
+class _Way:
+    """The paths of steps, which may leave the box, and where they end."""
+
+    def __init__(self, flow: RungeKutta, partition: Partition, sets: CellSets) -> None:
+        self.judge = PathJudge(flow, partition, sets, endpoint=False)
+        self.free = PathJudge(flow, partition, sets, endpoint=False)
+        self.free.ground = self.free.ground._replace(forbid=False)
+
+    @classmethod
+    def of(cls, problem: Problem, partition: Partition) -> "_Way | None":
+        """Return what judges the paths of a problem; None where images say all."""
+        flow = problem.flow(cost=False) if problem.judged == "path" else None
+        return None if flow is None else cls(flow, partition, CellSets.of(problem, partition))
+
+    def __call__(
+        self, values: Mapping[str, Floats], shape: tuple[int, ...], guard: Guard
+    ) -> tuple[tuple[Floats, ...], Bools]:
+        """Return images, or where A or avoid is entered, per axis; whether the box is left."""
+        place = self.free(values, shape, guard, places=True).place
+        left: Bools = np.isnan(self.judge(values, shape, guard, places=False).cell)
+        return tuple(x.reshape(shape) for x in place), left
 
 
 def _by_runs(trial: _Trial, cells: Indices) -> list[Hint]:

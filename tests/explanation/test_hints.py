@@ -184,3 +184,19 @@ def test_examples_are_explained(name):
         for region in cause.regions:
             assert (status[covered(found.partition, region)] == code).all()
     json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_trials_do_not_go_through_walls():
+    """Beyond a wall nothing helps: a run whose path is judged does not jump over it."""
+    problem = lm.Problem(
+        system={"kind": "ode", "derivative": {"x": "4*u"}, "step": 0.2},
+        state_box={"x": {"low": -1, "high": 1, "cells": 20}},
+        attractor={"boxes": [{"x": [-0.1, 0.1]}]},
+        avoid={"boxes": [{"x": [0.52, 0.58]}]},
+        control_grid={"u": {"values": [-1, 0, 1]}},
+        stage_cost="1",
+        sampling={"kind": "grid", "per_axis": 1},
+    )
+    found = lm.explain(problem)
+    assert found.lost == 4
+    assert found.hints == ()
