@@ -22,7 +22,8 @@ def work(problem):
     with contextlib.suppress(lm.BadInput):
         nodes = noise_nodes(problem)
         count = cells * control_count(problem) * sample_points(problem) * len(nodes.weights)
-        return count * getattr(problem.system, "substeps", 1)
+        substeps = getattr(problem.system, "substeps", 1)
+        return count * (1000 if substeps == "auto" else substeps)
     return math.inf
 
 

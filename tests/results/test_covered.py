@@ -66,7 +66,7 @@ def test_a_pendulum_with_one_sample_a_cell_says_so(solve, monkeypatch):
     status, out, err = solve(PENDULUM, "--json")
     runs = json.loads(out)["simulation"]
     assert runs["cut"]
-    assert 1_500 < runs["steps_made"] < 2_500
+    assert 100 < runs["steps_made"] < 2_500
     assert runs["reached"] + runs["lost"] + runs["cycling"] == 1_000
     monkeypatch.setattr(Deadline, "__call__", Counting(100_000))
     assert "too few" in solve(PENDULUM)[1]

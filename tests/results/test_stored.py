@@ -136,7 +136,14 @@ def test_every_field_of_the_certificate(saved):
             less = {k: v for k, v in good.items() if k != key}
             (saved / "certificate.json").write_bytes(reading.text(less))
             # What earlier versions did not say may be missing.
-            earlier = ("beyond_gamma", "local_controller", "scope", "coverage", "sure_cells")
+            earlier = (
+                "beyond_gamma",
+                "local_controller",
+                "scope",
+                "coverage",
+                "sure_cells",
+                "data",
+            )
             assert refused(saved) or key in earlier, key
     (saved / "certificate.json").write_bytes(reading.text(good))
     assert lm.verify(saved).holds
