@@ -118,7 +118,8 @@ class _Trial(MapTrial):
         admitted = self.admits(state, controls)
         fine = finite if admitted is None else finite & admitted
         if left is not None:  # and came back: by no side that a larger box would tell
-            fine = fine & ~(left & (over == 0).all(axis=0))
+            within = p.locate([np.broadcast_to(x, shape) for x in state]) >= 0
+            fine = fine & ~(left & within & (over == 0).all(axis=0))
         return images, over, np.where(fine, code, np.int64(CellStatus.AVOID))
 
     def side(self, number: int) -> tuple[str, str, float, float]:

@@ -200,3 +200,18 @@ def test_trials_do_not_go_through_walls():
     found = lm.explain(problem)
     assert found.lost == 4
     assert found.hints == ()
+
+
+@pytest.mark.parametrize("judged", ["path", "endpoint"])
+def test_a_run_may_come_back_into_the_box_along_its_path(judged):
+    """Towards an end at speed 1 with a brake of 1: x goes out, and comes back under it."""
+    problem = lm.Problem(
+        system={"kind": "ode", "derivative": {"x": "v", "v": "u"}, "step": 0.25, "judged": judged},
+        state_box={axis: {"low": -1, "high": 1, "cells": 10} for axis in "xv"},
+        attractor={"boxes": [{"x": [-0.4, 0.4], "v": [-0.6, 0.6]}]},
+        control_grid={"u": {"values": [-1, 0, 1]}},
+        stage_cost="1",
+        sampling={"kind": "grid", "per_axis": 1},
+    )
+    sides = [hint.numbers for hint in lm.explain(problem).hints if hint.kind == "larger box"]
+    assert {(side["axis"], side["end"]) for side in sides} >= {("x", "low"), ("x", "high")}
