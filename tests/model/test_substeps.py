@@ -138,3 +138,10 @@ def test_a_short_problem_is_settled_whatever_the_limit():
     result = lm.solve(made(decay(-10.0, "auto")), time_limit=1e-9)
     assert result.problem.system.substeps > 1
     assert result.integration_error is None or result.integration_error.halving < 0.01
+
+
+def test_stiff_equations_heed_the_limit():
+    """Few cells, but an equation that an accurate integrator follows in steps beyond number."""
+    data = decay(-1e7, "auto")
+    with pytest.raises(lm.TimeLimitReached):
+        lm.compile(made(data), time_limit=1e-9)

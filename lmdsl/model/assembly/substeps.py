@@ -99,7 +99,7 @@ def integration_error(
 def settled(problem: Problem, deadline: Deadline | None = None) -> Problem:
     """Return a problem whose substeps are a number: ``auto`` is as many as it takes.
 
-    What compiles in a moment is settled whatever the deadline.
+    What compiles in a moment has two seconds at least: stiff equations take longer than cells.
 
     Raises
     ------
@@ -108,7 +108,9 @@ def settled(problem: Problem, deadline: Deadline | None = None) -> Problem:
     """
     if getattr(problem.system, "substeps", None) != "auto":
         return problem
-    pairs, count = _Pairs.of(problem, None, unless_short(problem, Deadline.of(deadline))), 1
+    deadline = Deadline.of(deadline)
+    hurried = unless_short(problem, deadline) is deadline
+    pairs, count = _Pairs.of(problem, None, deadline if hurried else deadline.again()), 1
     assert pairs is not None
     coarse = pairs.images(1)
     while pairs.count and 2 * count <= MOST:
