@@ -89,14 +89,18 @@ def test_states_within_a_step_lie_at_equal_times():
 
 
 def test_costs_run_until_the_event():
-    """Rate x along -1 from s to 1: (s^2 - 1)/2; the terminal cost is paid once, times gamma."""
-    data = gliding(cost_rate="x", terminal_cost="5 + x", gamma=1.5)
+    """Rate 1 + x along -1 from s to 1, by its integral; the terminal cost once, times gamma."""
+
+    def integral(s, end):
+        return s - end + (s**2 - end**2) / 2
+
+    data = gliding(cost_rate="1 + x", terminal_cost="5 + x", gamma=1.5)
     del data["stage_cost"]
     found, _ = moved(data, [[2.5, 0.1], [6.5, 0.1]], [[-1], [-1]])
-    assert found.cost == pytest.approx([(2.5**2 - 1) / 2, (6.5**2 - 4.5**2) / 2], rel=1e-7)
+    assert found.cost == pytest.approx([integral(2.5, 1), integral(6.5, 4.5)], rel=1e-7)
     loop = lm.solve(made(data)).closed_loop
     runs = loop.run(np.array([[2.5, 0.1], [4.5, 0.1]]), 9, np.random.default_rng(0))
-    first, second = (2.5**2 - 1) / 2, (4.5**2 - 2.5**2) / 2
+    first, second = integral(2.5, 1), integral(4.5, 2.5)
     exact = [first + 1.5 * 6, second + 1.5 * first + 1.5**2 * 6]
     assert runs.cost == pytest.approx(exact, rel=1e-7)
 
