@@ -14,9 +14,8 @@ from lmdsl.common.types import Bools, Floats, Guard, Indices, Statuses
 from lmdsl.machine.kernels import fixed, kernel
 from lmdsl.model.assembly.paths.arcs import free_room
 from lmdsl.model.grid.axis import on_circle, on_interval
-from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.problem.problem import Problem
+from lmdsl.model.true_map import TrueMap
 from lmdsl.systems.accurate import AccurateFlow, Arc, place, places
 
 LOOKS = 32  # places of a path for each cell width that it covers, where an event may be near
@@ -51,19 +50,18 @@ class Integrator:
 
     Parameters
     ----------
-    problem, partition
-        A problem with a differential equation.
+    true_map
+        That of a problem with a differential equation.
     status
         What every cell is, shape (N,); None where nothing on the way is an event.
     """
 
-    def __init__(
-        self, problem: Problem, partition: Partition, status: Statuses | None = None
-    ) -> None:
+    def __init__(self, true_map: TrueMap, status: Statuses | None = None) -> None:
+        problem, partition = true_map.problem, true_map.partition
         flow = problem.flow()
         assert flow is not None
         self.flow, self.partition = AccurateFlow(flow, partition.width), partition
-        self.names = (*problem.states, *problem.controls, *problem.noises)
+        self._true_map = true_map
         self.status, self._room = status, np.zeros(0, dtype=np.uint8)
         self.judged = status is not None and problem.judged == "path"
         if status is not None and self.judged:
@@ -80,11 +78,8 @@ class Integrator:
         self, x: Floats, u: Floats, w: Sequence[Floats], guard: Guard | None = None
     ) -> Floats:
         """Return where runs are after the step, whatever they meet, not wrapped, shape (r, d)."""
-        end = self.flow(self._held(x, u, w), guard)
+        end = self.flow(self._true_map.named(list(x.T), list(u.T), w), guard)
         return np.ascontiguousarray(end[: self.partition.dimension].T)
-
-    def _held(self, x: Floats, u: Floats, w: Sequence[Floats]) -> dict[str, Floats]:
-        return dict(zip(self.names, (*x.T, *u.T, *w), strict=True))
 
     def move(
         self,
@@ -100,7 +95,7 @@ class Integrator:
         With ``absorb`` a run ends where it enters the attractor. ``pieces`` states are wanted from
         within the step, at equal distances in time.
         """
-        held = self._held(x, u, w)
+        held = self._true_map.named(list(x.T), list(u.T), w)
         watch = _Watch(self, len(x), absorb, pieces)
         needed = self.judged or pieces
         end = self.flow(held, guard, watch if needed else None)

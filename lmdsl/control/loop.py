@@ -117,7 +117,7 @@ class ClosedLoop:
         """What makes the steps."""
         if self.as_compiled or self.problem.flow() is None:
             return CompiledSteps(self.true_map)
-        return Integrator(self.problem, self.partition, self.status)
+        return Integrator(self.true_map, self.status)
 
     @property
     def method(self) -> str:

@@ -67,7 +67,7 @@ def constant_map(problem: Problem, partition: Partition, fine: bool = False) -> 
     if fine:
         system = system.model_copy(update={"step": system.step / PIECES})
         problem = problem.model_copy(update={"system": system})
-    integrator = Integrator(problem, partition)
+    integrator = Integrator(TrueMap(problem, partition))
     return lambda x, u: integrator.images(x, u, held(x))
 
 

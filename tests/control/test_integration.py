@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 import lmdsl as lm
 from lmdsl.control.integration import Integrator
 from lmdsl.control.steps import Drawn
+from lmdsl.model.true_map import TrueMap
 
 
 def gliding(**more):
@@ -33,7 +34,7 @@ def gliding(**more):
 def moved(data, x, u, absorb=True, pieces=0):
     problem = made(data)
     lp = lm.compile(problem)
-    integrator = Integrator(lp.problem, lp.partition, lp.cell_status)
+    integrator = Integrator(TrueMap(lp.problem, lp.partition), lp.cell_status)
     x, u = np.array(x, dtype=float), np.array(u, dtype=float)
     return integrator.move(x, u, [], absorb=absorb, pieces=pieces), lp
 
