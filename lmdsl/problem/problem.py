@@ -28,7 +28,7 @@ from lmdsl.problem.sampling import SamplingUnion
 from lmdsl.problem.sets import REACHED_OR_ENDED, Attractor, Avoid, Measure
 from lmdsl.problem.unions import SystemUnion
 from lmdsl.systems import FunctionSystem, System
-from lmdsl.systems.base import Judged, StateMap
+from lmdsl.systems.base import Judged, Names, StateMap
 from lmdsl.systems.black_box.cost import StageCost, cost_map
 from lmdsl.systems.runge_kutta import RungeKutta
 
@@ -146,10 +146,14 @@ class Problem(Declared):
         """Whether gamma times the discount is below 1: then no run costs more than a finite sum."""
         return self.discount is not None and endings.rate(self) < 1
 
+    def names(self) -> Names:
+        """Return what the system may name."""
+        return Names(self.states, self.controls, self.noises, self.definitions())
+
     def step(self) -> StateMap:
         """Return the map of the system, from named arrays to images."""
         system: System = self.system
-        return system.compile(self.states, self.controls, self.noises, self.definitions())
+        return system.compile(self.names())
 
     def formula(
         self,
@@ -205,7 +209,7 @@ class Problem(Declared):
         """Return how the equation, and with it the cost rate, is integrated; None for a map."""
         system: System = self.system
         rate = self.cost() if cost and self.cost_rate is not None else None
-        return system.flow(self.states, self.controls, self.noises, rate, self.definitions())
+        return system.flow(self.names(), rate)
 
     @property
     def functions(self) -> tuple[str, ...]:

@@ -1,14 +1,14 @@
 """What a system is: states, and a function that maps arrays of states to their images.
 
-Every system answers one question, ``compile(states, controls, noise)``: a :class:`StateMap`.
+Every system answers one question, ``compile(names)``: a :class:`StateMap`.
 Formulas and users' own Python functions meet this one contract, so everything downstream
 (transitions, simulation, proofs, plots) treats them alike. Every right-hand side sees the old
 values.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
@@ -34,25 +34,45 @@ UNSETTLED = 16  # substeps where as many as it takes are asked for, before these
 Judged = Literal["path", "endpoint"]
 
 
+class Names(NamedTuple):
+    """What formulas and functions of a system may name, its parameters apart.
+
+    Attributes
+    ----------
+    states
+        In the order of the axes.
+    controls, noise
+        What is chosen in a step, and what is drawn.
+    definitions
+        What ``let`` defines by these; only formulas use it.
+    """
+
+    states: tuple[str, ...]
+    controls: tuple[str, ...] = ()
+    noise: tuple[str, ...] = ()
+    definitions: Definitions = NO_DEFINITIONS
+
+    @property
+    def valued(self) -> tuple[str, ...]:
+        """Names of all that has a value in a step."""
+        return (*self.states, *self.controls, *self.noise)
+
+
 def program(
-    formulas: Mapping[str, str],
-    order: Sequence[str],
-    names: Sequence[str],
-    parameters: Mapping[str, float],
-    where: str,
-    definitions: Definitions = NO_DEFINITIONS,
+    formulas: Mapping[str, str], names: Names, parameters: Mapping[str, float], where: str
 ) -> Program:
-    """Compile the formulas of the states, in the given order, into one program.
+    """Compile the formulas of the states, in their order, into one program.
 
     BadInput: a formula is missing, belongs to no state, or cannot be parsed.
     """
-    known, parsed = frozenset((*names, *parameters)), []
+    known, parsed = frozenset((*names.valued, *parameters)), []
+    order = names.states
 
     def parse_one(state: str) -> None:
         if state not in formulas:
             raise BadInput(f"no formula for state {state!r}; add one", where)
         try:
-            parsed.append(parse(formulas[state], known, definitions))
+            parsed.append(parse(formulas[state], known, names.definitions))
         except BadInput as error:
             raise BadInput(error.message, f"{where}.{state}") from None
 
@@ -112,27 +132,11 @@ class System(Declared):
         """Return the values of all parameters, defaults included."""
         return self.parameters
 
-    def compile(
-        self,
-        states: Sequence[str],
-        controls: Sequence[str],
-        noise: Sequence[str],
-        definitions: Definitions = NO_DEFINITIONS,
-    ) -> StateMap:
-        """Return the function from named arrays to the images, one array per state in order.
-
-        Formulas may use ``definitions`` (the ``let`` of a problem).
-        """
+    def compile(self, names: Names) -> StateMap:
+        """Return the function from named arrays to the images, one array per state in order."""
         raise NotImplementedError
 
-    def flow(
-        self,
-        states: Sequence[str],
-        controls: Sequence[str],
-        noise: Sequence[str],
-        integrand: Formula | None = None,
-        definitions: Definitions = NO_DEFINITIONS,
-    ) -> RungeKutta | None:
+    def flow(self, names: Names, integrand: Formula | None = None) -> RungeKutta | None:
         """Return how the differential equation is integrated; None for a map, which has none.
 
         With an integrand, its integral along the step is the last of what is integrated.
@@ -152,22 +156,9 @@ class MapSystem(System):
     kind: Literal["map"] = "map"
     next: Formulas
 
-    def compile(
-        self,
-        states: Sequence[str],
-        controls: Sequence[str],
-        noise: Sequence[str],
-        definitions: Definitions = NO_DEFINITIONS,
-    ) -> StateMap:
+    def compile(self, names: Names) -> StateMap:
         """See :meth:`System.compile`."""
-        return program(
-            self.next,
-            states,
-            [*states, *controls, *noise],
-            self.parameters,
-            "system.next",
-            definitions,
-        )
+        return program(self.next, names, self.parameters, "system.next")
 
 
 class OdeSystem(System):
@@ -192,34 +183,14 @@ class OdeSystem(System):
     substeps: Substeps = 1
     judged: Judged = "path"
 
-    def compile(
-        self,
-        states: Sequence[str],
-        controls: Sequence[str],
-        noise: Sequence[str],
-        definitions: Definitions = NO_DEFINITIONS,
-    ) -> StateMap:
+    def compile(self, names: Names) -> StateMap:
         """See :meth:`System.compile`."""
-        return self.flow(states, controls, noise, None, definitions)
+        return self.flow(names)
 
-    def flow(
-        self,
-        states: Sequence[str],
-        controls: Sequence[str],
-        noise: Sequence[str],
-        integrand: Formula | None = None,
-        definitions: Definitions = NO_DEFINITIONS,
-    ) -> RungeKutta:
+    def flow(self, names: Names, integrand: Formula | None = None) -> RungeKutta:
         """See :meth:`System.flow`."""
-        field = program(
-            self.derivative,
-            states,
-            [*states, *controls, *noise],
-            self.parameters,
-            "system.derivative",
-            definitions,
-        )
+        field = program(self.derivative, names, self.parameters, "system.derivative")
         if integrand is not None:
             field = Program([*field.formulas, integrand], self.parameters)
         count = UNSETTLED if self.substeps == "auto" else self.substeps
-        return RungeKutta(field, tuple(states), self.step, count)
+        return RungeKutta(field, names.states, self.step, count)

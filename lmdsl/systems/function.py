@@ -12,8 +12,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from lmdsl.common.strict_model import plain
 from lmdsl.errors import BadInput
-from lmdsl.formulas.language import NO_DEFINITIONS, Definitions
-from lmdsl.systems.base import StateMap, System
+from lmdsl.systems.base import Names, StateMap, System
 from lmdsl.systems.black_box.function_map import FunctionMap
 from lmdsl.systems.black_box.returned import Returned
 from lmdsl.systems.black_box.scalar_map import ScalarMap
@@ -70,16 +69,10 @@ class FunctionSystem(System):
         """Say that no JSON is a function."""
         return {"not": {}}
 
-    def compile(
-        self,
-        states: Sequence[str],
-        controls: Sequence[str],
-        noise: Sequence[str],
-        definitions: Definitions = NO_DEFINITIONS,
-    ) -> StateMap:
+    def compile(self, names: Names) -> StateMap:
         """See :meth:`System.compile`."""
-        _require_called(self.next, (*states, *controls, *noise, *self.parameters))
-        results = Returned(tuple(states), WHERE)
+        _require_called(self.next, (*names.valued, *self.parameters))
+        results = Returned(names.states, WHERE)
         if self.vectorized:
             return FunctionMap(self.next, results, self.parameters)
         return ScalarMap(self.next, results, self.parameters, processes=self.processes)

@@ -1,7 +1,7 @@
 """Systems with a name: formulas written once, parameters to choose."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar, Self
 
 from pydantic import model_validator
@@ -9,9 +9,9 @@ from pydantic import model_validator
 from lmdsl.common import spelling
 from lmdsl.common.strict_model import Positive
 from lmdsl.errors import BadInput, shown
-from lmdsl.formulas.language import NO_DEFINITIONS, Definitions, Formula
+from lmdsl.formulas.language import NO_DEFINITIONS, Formula
 from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
-from lmdsl.systems.base import Judged, MapSystem, OdeSystem, StateMap, Substeps, System
+from lmdsl.systems.base import Judged, MapSystem, Names, OdeSystem, StateMap, Substeps, System
 from lmdsl.systems.runge_kutta import RungeKutta
 
 
@@ -68,27 +68,21 @@ class NamedSystem(System):
         """Return the same system with its formulas written out."""
         raise NotImplementedError
 
-    def compile(
-        self,
-        states: Sequence[str],
-        controls: Sequence[str],
-        noise: Sequence[str],
-        definitions: Definitions = NO_DEFINITIONS,
-    ) -> StateMap:
+    def compile(self, names: Names) -> StateMap:
         """See :meth:`System.compile`."""
-        if set(states) != set(self.formulas):
+        if set(names.states) != set(self.formulas):
             raise BadInput(
                 f"{self.kind} has the states {', '.join(self.formulas)}; declare these axes",
                 "state_box",
             )
         for control in self.controls():
-            if control not in controls and control not in noise:
+            if control not in names.controls and control not in names.noise:
                 raise BadInput(
                     f"{self.kind} has the control {control}; declare it, for example "
                     f'"{control}": {{"values": [0]}}',
                     "control_grid",
                 )
-        return self.definition().compile(states, controls, noise)
+        return self.definition().compile(names._replace(definitions=NO_DEFINITIONS))
 
 
 class NamedMap(NamedSystem):
@@ -126,16 +120,9 @@ class NamedOde(NamedSystem):
             judged=self.judged,
         )
 
-    def flow(
-        self,
-        states: Sequence[str],
-        controls: Sequence[str],
-        noise: Sequence[str],
-        integrand: Formula | None = None,
-        definitions: Definitions = NO_DEFINITIONS,
-    ) -> RungeKutta:
+    def flow(self, names: Names, integrand: Formula | None = None) -> RungeKutta:
         """See :meth:`System.flow`."""
-        return self.definition().flow(states, controls, noise, integrand)
+        return self.definition().flow(names._replace(definitions=NO_DEFINITIONS), integrand)
 
 
 class NotStored(BadInput):

@@ -10,6 +10,7 @@ from scipy.linalg import expm
 import lmdsl as lm
 from lmdsl.formulas.program import Program
 from lmdsl.systems.accurate import TOLERANCE, AccurateFlow, has_kinks, places
+from lmdsl.systems.base import Names
 
 EQUATIONS = {
     "van_der_pol": ({"x": "v", "v": "3*(1 - x**2)*v - x + u"}, 0.7),
@@ -22,7 +23,7 @@ EQUATIONS = {
 
 def made_flow(derivative, step, width=0.1, controls=("u",), substeps=1):
     system = lm.systems.OdeSystem(derivative=derivative, step=step, substeps=substeps)
-    flow = system.flow(tuple(derivative), controls, ())
+    flow = system.flow(Names(tuple(derivative), controls))
     return AccurateFlow(flow, np.full(len(derivative), width))
 
 
@@ -126,6 +127,6 @@ def test_what_grows_without_limit_has_no_end():
      ("sign(sin(x))", True), ("x*x", False)],
 )  # fmt: skip
 def test_kinks_count_where_the_states_stand_in_them(text, kinked):
-    field = lm.systems.OdeSystem(derivative={"x": text}, step=1.0).flow(("x",), ("u",), ()).field
+    field = lm.systems.OdeSystem(derivative={"x": text}, step=1.0).flow(Names(("x",), ("u",))).field
     assert isinstance(field, Program)
     assert has_kinks(field, ("x",)) == kinked

@@ -13,6 +13,7 @@ import lmdsl as lm
 from lmdsl.formulas.language import parse
 from lmdsl.formulas.program import Program
 from lmdsl.systems import from_casadi
+from lmdsl.systems.base import Names
 from lmdsl.systems.translated.casadi_systems import CasadiFunction
 
 ca = pytest.importorskip("casadi")
@@ -91,7 +92,7 @@ def test_matrices_are_taken_column_by_column():
     values = {name: rng.uniform(size=(3, 1, 5)) for name in names}
     values["b"] = values["b"][:1]
     called = CasadiFunction(square, [names, ()], [0], names)(**values)
-    written = system.compile(names, [], [])(values)
+    written = system.compile(Names(names))(values)
     table = np.array([np.broadcast_to(values[name], (3, 1, 5)) for name in names])
     for k in np.ndindex(3, 1, 5):
         wanted = np.linalg.matrix_power(table[(slice(None), *k)].reshape(2, 2).T, 2).T.ravel()
@@ -164,7 +165,7 @@ def test_what_has_no_formula_is_called(tmp_path):
     with pytest.warns(UserWarning, match="no place for erf"):
         system = from_casadi(f, step=0.5, substeps=2)
     values = {"x": np.array([[1.0], [2.0]]), "u": np.array([[0.0, 4.0]])}
-    images = system.compile(["x"], ["u"], [])(values)[0]
+    images = system.compile(Names(("x",), ("u",)))(values)[0]
     h = 0.25
     growth, gain = (1 + h + h**2 / 2 + h**3 / 6 + h**4 / 24) ** 2, values["u"] / 4
     np.testing.assert_allclose(images, growth * (values["x"] - gain) + gain)
@@ -175,7 +176,7 @@ def test_integrators_and_tables_are_called():
 
     with pytest.warns(UserWarning, match="the CvodesInterface flow"):
         system = from_casadi(integrator(), {"s": ["q", "w"]})
-    step = system.compile(["q", "w"], ["u"], [])
+    step = system.compile(Names(("q", "w"), ("u",)))
     got = step({"q": np.array([0.3, 1.0]), "w": np.array([0.0, -1.0]), "u": np.array([0.5, 0.0])})
     for k, (q, w, v) in enumerate([(0.3, 0.0, 0.5), (1.0, -1.0, 0.0)]):
         flow = solve_ivp(lambda _, s, v=v: [s[1], v - np.sin(s[0])], (0, 0.1), [q, w], rtol=1e-10)

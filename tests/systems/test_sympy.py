@@ -13,6 +13,7 @@ import lmdsl as lm
 from lmdsl.formulas.language import parse
 from lmdsl.formulas.program import Program
 from lmdsl.systems import from_sympy
+from lmdsl.systems.base import Names
 from lmdsl.systems.translated import sympy_systems, systems
 from lmdsl.systems.translated.terms import Untranslatable
 
@@ -202,7 +203,7 @@ def test_a_differential_equation_without_formulas():
     values = {"x": np.array([[1.0], [2.0]]), "u": np.array([[0.0, 1.0]])}
     h = 0.25
     factor = (1 - h + h**2 / 2 - h**3 / 6 + h**4 / 24) ** 2
-    images = system.compile(["x"], ["u"], [])(values)[0]
+    images = system.compile(Names(("x",), ("u",)))(values)[0]
     np.testing.assert_allclose(
         np.broadcast_to(images, (2, 2)), factor * values["x"] + 0 * values["u"]
     )

@@ -1,6 +1,6 @@
 """A finite model as a system: its rows are given, nothing is sampled."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any, ClassVar, Literal
 
@@ -10,8 +10,7 @@ from pydantic import Field
 from lmdsl.common.strict_model import Number
 from lmdsl.common.types import Floats, Guard, Indices
 from lmdsl.errors import BadInput
-from lmdsl.formulas.language import NO_DEFINITIONS, Definitions
-from lmdsl.systems.base import StateMap, System
+from lmdsl.systems.base import Names, StateMap, System
 from lmdsl.systems.matrices.rows import GivenRows
 
 
@@ -37,13 +36,7 @@ class MatrixSystem(System):
         """Say that no JSON is a finite model."""
         return {"not": {}}
 
-    def compile(
-        self,
-        states: Sequence[str],
-        controls: Sequence[str],
-        noise: Sequence[str],
-        definitions: Definitions = NO_DEFINITIONS,
-    ) -> StateMap:
+    def compile(self, names: Names) -> StateMap:
         """See :meth:`System.compile`; the map is defined, but refuses to be evaluated."""
         return GivenMap()
 
