@@ -41,7 +41,7 @@ def require_consistent(problem: "Problem") -> None:
 
 def _formulas(problem: "Problem") -> Iterator[Callable[[], object]]:
     """Yield what parses the formulas of a problem, those of ``let`` first."""
-    yield problem.definitions
+    yield problem.names
     yield problem.step
     if problem.stage_cost is not None or problem.cost_rate is not None:
         yield lambda: problem.stage() or problem.cost()

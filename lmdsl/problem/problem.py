@@ -15,7 +15,7 @@ from lmdsl.common import inputs
 from lmdsl.common.files import read_json, write_whole
 from lmdsl.common.strict_model import Declared, FileSchema, Fractional, Positive
 from lmdsl.errors import BadInput, shown
-from lmdsl.formulas.language import Definitions, Formula, defined, parse, parse_condition
+from lmdsl.formulas.language import Formula, defined, parse, parse_condition
 from lmdsl.formulas.names import FormulaText, Let
 from lmdsl.formulas.program import Program
 from lmdsl.problem import endings
@@ -146,10 +146,6 @@ class Problem(Declared):
         """Whether gamma times the discount is below 1: then no run costs more than a finite sum."""
         return self.discount is not None and endings.rate(self) < 1
 
-    def names(self) -> Names:
-        """Return what the system may name."""
-        return Names(self.states, self.controls, self.noises, self.definitions())
-
     def step(self) -> StateMap:
         """Return the map of the system, from named arrays to images."""
         system: System = self.system
@@ -185,17 +181,18 @@ class Problem(Declared):
         known = {"state": self.states, "control": self.controls, "noise": self.noises}
         for kind in kinds:
             names.update(known[kind])
-        definitions = self.definitions()  # whose faults are not of this field
+        definitions = self.names().definitions  # whose faults are not of this field
         try:
             return (parse_condition if condition else parse)(text, names, definitions)
         except BadInput as error:
             raise BadInput(error.message, where) from None
 
-    def definitions(self) -> Definitions:
-        """Return what ``let`` defines, parsed."""
-        names = (*self.states, *self.controls, *self.noises, *self.system.constants())
+    def names(self) -> Names:
+        """Return what the system may name, with what ``let`` defines by it, parsed."""
+        names = Names(self.states, self.controls, self.noises)
+        known = (*names.valued, *self.system.constants())
         try:
-            return defined(tuple((self.let or {}).items()), names)
+            return names._replace(definitions=defined(tuple((self.let or {}).items()), known))
         except BadInput as error:
             raise BadInput(error.message, f"let.{error.where}") from None
 
