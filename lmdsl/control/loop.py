@@ -72,6 +72,8 @@ class Runs(NamedTuple):
         shape (r,).
     arrived
         States in which the runs that reached A entered it, in no particular order, shape (., d).
+    power, dearest
+        What the next step of the others would be weighed by, and the largest cost of a step.
     """
 
     outcome: Indices
@@ -79,6 +81,8 @@ class Runs(NamedTuple):
     loss: Indices
     cost: Floats
     arrived: Floats
+    power: float
+    dearest: float
 
 
 class ClosedLoop:
@@ -182,7 +186,7 @@ class ClosedLoop:
         outcome = np.full(len(x), CYCLING, dtype=np.int64)
         taken = np.full(len(x), steps, dtype=np.int64)
         loss, cost = np.zeros(len(x), dtype=np.int64), np.zeros(len(x))
-        active, power = np.arange(len(x)), 1.0
+        active, power, dearest = np.arange(len(x)), 1.0, 0.0
         for n in range(steps + 1):
             state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
             for code, ended in (
@@ -193,7 +197,7 @@ class ClosedLoop:
                 taken[active[ended]] = n
                 if code == REACHED:
                     arrived.append(x[ended])
-                    cost[active[ended]] += (power * self._paid(x[ended])) if n else 0.0
+                    cost[active[ended]] += (power * self.paid(x[ended])) if n else 0.0
                 else:
                     loss[active[ended]] = _losses(cell[ended], state[ended])
             on = state == CellStatus.STABILIZED
@@ -209,9 +213,10 @@ class ClosedLoop:
             with np.errstate(all="ignore"):
                 cost[active] += power * moved.cost
                 power *= self.weight
-        return Runs(outcome, taken, loss, cost, np.concatenate(arrived))
+                dearest = max(dearest, float(moved.cost.max()))
+        return Runs(outcome, taken, loss, cost, np.concatenate(arrived), power, dearest)
 
-    def _paid(self, x: Floats) -> Floats:
+    def paid(self, x: Floats) -> Floats:
         """Return the terminal costs of states in A, shape (r,)."""
         system, missed = self.problem.system, 0.0
         if isinstance(system, MatrixSystem):

@@ -7,6 +7,7 @@ import numpy as np
 
 from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Floats, Indices
+from lmdsl.control.costs import MeanCost, mean_cost
 from lmdsl.control.loop import CYCLING, LOSSES, LOST, REACHED, ClosedLoop, Held, draw_starts
 from lmdsl.control.steps import AS_DECLARED
 from lmdsl.errors import BadInput
@@ -43,8 +44,10 @@ class Simulation(Frozen):
     lost_to
         The lost by ``outside`` (left the box), ``avoid`` and ``no_control`` (entered such a cell).
     cost
-        ``mean`` over the reached of what they paid, and its ``standard_error`` (None for one run);
-        None where none reached. To be compared with the certificate's cost where all reach.
+        ``mean`` of what ``runs`` paid, its ``standard_error`` (None for one run), and ``cut_off``,
+        at most how much more they pay later. The runs are the reached; with a discount, and gamma
+        times it below 1, all but the lost. None where there are none. To be compared with the
+        certificate's cost where none is left out.
     method
         What was followed, in words: the map, or how its equation was integrated.
     followed
@@ -62,7 +65,7 @@ class Simulation(Frozen):
     cut: bool = False
     aimed: bool = True
     lost_to: dict[str, int] = field(default_factory=lambda: dict.fromkeys(LOSSES, 0))
-    cost: dict[str, float | None] | None = None
+    cost: MeanCost | None = None
     method: str = ""
     followed: str = "true map"
 
@@ -107,9 +110,7 @@ class Simulation(Frozen):
             steps = ", ".join(f"{k} {v}" for k, v in self.steps.items())
             lines.append(f"  steps                  {steps}")
         if self.cost:
-            mean, error = self.cost["mean"], self.cost["standard_error"]
-            spread = "" if error is None else f" +- {error:.2g} (standard error)"
-            lines.append(f"  cost of the reached    {mean:.6g}{spread}")
+            lines.append(self._paid(self.cost))
         if self.held:
             held = self.held
             lines += [
@@ -127,6 +128,15 @@ class Simulation(Frozen):
         return "\n".join(lines)
 
     __str__ = text
+
+    def _paid(self, cost: MeanCost) -> str:
+        """Return what runs paid in the mean, and what that lacks."""
+        error, cut_off, count = cost["standard_error"], cost["cut_off"], cost["runs"]
+        whose = {self.starts: "all runs   ", self.reached: "the reached"}
+        text = f"  cost of {whose.get(int(count or 0), 'runs kept  ')}    {cost['mean']:.6g}"
+        text += "" if error is None else f" +- {error:.2g} (standard error)"
+        later = f", and {cut_off:.2g} more at most after {self.steps_made} steps"
+        return text + later * bool(cut_off)
 
     def _causes(self) -> str:
         """Return by what runs were lost, in brackets; empty where none was."""
@@ -194,19 +204,10 @@ def simulate(
         lost_to={
             name: int(((outcome == LOST) & (runs.loss == k)).sum()) for k, name in enumerate(LOSSES)
         },
-        cost=_mean(runs.cost[outcome == REACHED]),
+        cost=mean_cost(loop, runs),
         method=loop.method,
         followed=loop.followed,
     )
-
-
-def _mean(cost: Floats) -> dict[str, float | None] | None:
-    """Return the mean cost of runs and its standard error; None where none is known."""
-    if not len(cost) or np.isnan(cost).any():
-        return None
-    with np.errstate(all="ignore"):
-        error = float(cost.std(ddof=1) / np.sqrt(len(cost))) if len(cost) > 1 else None
-        return {"mean": float(cost.mean()), "standard_error": error}
 
 
 def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
