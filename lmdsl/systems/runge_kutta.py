@@ -1,6 +1,6 @@
 """The classical Runge-Kutta method of order four: an equation becomes a map, its steps a path."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -36,9 +36,27 @@ class Knot(NamedTuple):
     stages: tuple[tuple[Floats, ...], ...] = ()
 
 
-class _Substep(NamedTuple):
-    slopes: tuple[tuple[Any, ...], ...]  # k1 to k4
+class Substep(NamedTuple):
+    """The slopes k1 to k4 of a substep, and where it ends."""
+
+    slopes: tuple[tuple[Any, ...], ...]
     end: tuple[Any, ...]
+
+
+def rk4(
+    slope: Callable[[Sequence[Any]], tuple[Any, ...]], state: Sequence[Any], h: float, count: int
+) -> Iterator[Substep]:
+    """Yield substeps of arrays, jets or terms: the arithmetic is the same."""
+    for _ in range(count):
+        k1 = slope(state)
+        k2 = slope([x + (h / 2) * k for x, k in zip(state, k1, strict=True)])
+        k3 = slope([x + (h / 2) * k for x, k in zip(state, k2, strict=True)])
+        k4 = slope([x + h * k for x, k in zip(state, k3, strict=True)])
+        state = tuple(
+            x + (h / 6) * (a + 2 * b + 2 * c + d)
+            for x, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
+        )
+        yield Substep((k1, k2, k3, k4), state)
 
 
 class RungeKutta:
@@ -119,22 +137,12 @@ class RungeKutta:
 
     def _substeps(
         self, values: Mapping[str, Any], state: tuple[Any, ...], field: Any
-    ) -> Iterator[_Substep]:
-        """Step arrays, jets or terms: the arithmetic is the same."""
-        held, h = dict(values), self.h
+    ) -> Iterator[Substep]:
+        held = dict(values)
 
         def slope(at: Sequence[Any]) -> tuple[Any, ...]:
             held.update(zip(self.states, at, strict=False))
             image: tuple[Any, ...] = field(held)
             return image
 
-        for _ in range(self.substeps):
-            k1 = slope(state)
-            k2 = slope([x + (h / 2) * k for x, k in zip(state, k1, strict=True)])
-            k3 = slope([x + (h / 2) * k for x, k in zip(state, k2, strict=True)])
-            k4 = slope([x + h * k for x, k in zip(state, k3, strict=True)])
-            state = tuple(
-                x + (h / 6) * (a + 2 * b + 2 * c + d)
-                for x, a, b, c, d in zip(state, k1, k2, k3, k4, strict=True)
-            )
-            yield _Substep((k1, k2, k3, k4), state)
+        return rk4(slope, state, self.h, self.substeps)

@@ -13,8 +13,7 @@ from lmdsl.systems.black_box.returned import Returned
 from lmdsl.systems.black_box.scalar_map import ScalarMap
 from lmdsl.systems.function import FunctionSystem
 from lmdsl.systems.translated import casadi_systems, sympy_systems
-from lmdsl.systems.translated.casadi_systems import is_casadi
-from lmdsl.systems.translated.sympy_systems import is_sympy
+from lmdsl.systems.translated.systems import comes_from
 from lmdsl.systems.translated.terms import Untranslatable
 
 # What a result directory says in place of a function.
@@ -22,14 +21,14 @@ FUNCTION: Final = {"kind": "function"}
 
 
 def _read(value: Any, formula: Callable[[Any], Any]) -> Any:
-    tool = sympy_systems if is_sympy(value) else casadi_systems if is_casadi(value) else None
-    if tool is not None:  # whose expressions can be called, too, but not with arrays by name
-        try:
-            return formula(tool.text(value))
-        except Untranslatable as why:
-            raise BadInput(
-                f"formulas have no place for {why}; write the cost as a Python function"
-            ) from None
+    for package, tool in (("sympy", sympy_systems), ("casadi", casadi_systems)):
+        if comes_from(package, value):  # it may be callable, but not with arrays by name
+            try:
+                return formula(tool.text(value))
+            except Untranslatable as why:
+                raise BadInput(
+                    f"formulas have no place for {why}; write the cost as a Python function"
+                ) from None
     return value if callable(value) else formula(value)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from lmdsl.errors import BadInput, shown
 from lmdsl.systems.base import System
 from lmdsl.systems.translated import systems, terms
+from lmdsl.systems.translated.systems import Images
 from lmdsl.systems.translated.terms import ONE, ZERO, Choice, Piece, Untranslatable
 
 # Operations on one number, by their names in CasADi.
@@ -77,16 +78,13 @@ def from_casadi(
         The names of the states, in the order of the outputs; by default those of the first input.
     outputs
         The outputs that are images, by name; by default all of them.
-    parameters
-        Names that are constants, and their values.
-    step, substeps
-        The sampling time of a differential equation, and Runge-Kutta steps in it.
+    parameters, step, substeps
+        As of :func:`from_sympy`.
 
     Returns
     -------
-    MapSystem or OdeSystem
-        With formulas; a FunctionSystem, and a warning that names the reason, where the language of
-        formulas lacks something.
+    MapSystem or OdeSystem or FunctionSystem
+        As of :func:`from_sympy`.
 
     Raises
     ------
@@ -102,21 +100,13 @@ def from_casadi(
     names = _arguments(function, arguments)
     chosen = _outputs(function, outputs)
     wanted = _states(function, names, chosen, states)
-    constants, time = dict(parameters or {}), systems.of_time(step, substeps)
-    try:
-        formulas = dict(zip(wanted, _texts(casadi, function, names, chosen), strict=True))
-        systems.require_size(formulas, [name for each in names for name in each])
-    except Untranslatable as why:
-        field = CasadiFunction(function, names, chosen, tuple(wanted))
-        return systems.of_function(field, wanted, constants, time, str(why))
-    return systems.of_formulas(formulas, constants, time)
-
-
-def is_casadi(value: Any) -> bool:
-    """Return whether a value is CasADi's, without importing it."""
-    return any(
-        (each.__module__ or "").partition(".")[0] == "casadi" for each in type(value).__mro__
+    images = Images(
+        wanted,
+        [name for each in names for name in each],
+        partial(_texts, casadi, function, names, chosen),
+        partial(CasadiFunction, function, names, chosen, tuple(wanted)),
     )
+    return systems.system_of(images, dict(parameters or {}), step, substeps)
 
 
 def text(function: Any) -> str:

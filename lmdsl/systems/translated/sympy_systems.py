@@ -10,6 +10,7 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.operations import FORMULA_FUNCTIONS
 from lmdsl.systems.base import System
 from lmdsl.systems.translated import systems, terms
+from lmdsl.systems.translated.systems import Images, comes_from
 from lmdsl.systems.translated.terms import ONE, ZERO, Choice, Piece, Untranslatable
 
 # Functions that have the same name in the language.
@@ -81,20 +82,14 @@ def from_sympy(
         raise BadInput("give a mapping from states to expressions, such as {x: x + u}", "system")
     wanted = {_name(key): _expression(sympy, value) for key, value in expressions.items()}
     wanted = {state: _real(value) for state, value in wanted.items()}
+    images = Images(
+        [*wanted],
+        [_name(e) for e in _variables(wanted.values())],
+        lambda: [text(value) for value in wanted.values()],
+        lambda: _Lambdified(wanted),
+    )
     constants = {_name(key): value for key, value in (parameters or {}).items()}
-    time = systems.of_time(step, substeps)
-    try:
-        formulas = {state: text(value) for state, value in wanted.items()}
-        systems.require_size(formulas, [_name(e) for e in _variables(wanted.values())])
-    except Untranslatable as why:
-        field = _Lambdified(wanted)
-        return systems.of_function(field, [*wanted], constants, time, str(why))
-    return systems.of_formulas(formulas, constants, time)
-
-
-def is_sympy(value: Any) -> bool:
-    """Return whether a value is SymPy's, without importing it."""
-    return any((each.__module__ or "").partition(".")[0] == "sympy" for each in type(value).__mro__)
+    return systems.system_of(images, constants, step, substeps)
 
 
 def text(expression: Any) -> str:
@@ -208,9 +203,9 @@ def _name(key: Any) -> str:
     """Return the name of a symbol, of a signal, or of who is called so."""
     if isinstance(key, str):
         return key
-    if is_sympy(key) and getattr(key, "is_Symbol", False):
+    if comes_from("sympy", key) and getattr(key, "is_Symbol", False):
         return str(key.name)
-    if is_sympy(key) and _is_signal(key):
+    if comes_from("sympy", key) and _is_signal(key):
         return str(key.func.__name__)
     raise BadInput(f"{shown(key)} is neither a symbol nor a name", "system")
 

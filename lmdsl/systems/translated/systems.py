@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,7 +11,34 @@ from lmdsl.errors import BadInput, MissingDependency
 from lmdsl.formulas.language import parse
 from lmdsl.systems.base import MapSystem, OdeSystem, System
 from lmdsl.systems.function import FunctionSystem
+from lmdsl.systems.runge_kutta import rk4
 from lmdsl.systems.translated.terms import Untranslatable
+
+
+class Images(NamedTuple):
+    """The images of states as another tool has them, in two ways.
+
+    Attributes
+    ----------
+    states
+        Their names.
+    names
+        What formulas may name.
+    write
+        Return a formula for each state; Untranslatable where the language lacks something.
+    call
+        Return the same as a function of arrays by name.
+    """
+
+    states: Sequence[str]
+    names: Sequence[str]
+    write: Callable[[], Sequence[str]]
+    call: Callable[[], Callable[..., Mapping[str, Any]]]
+
+
+def comes_from(package: str, value: Any) -> bool:
+    """Return whether a value is of a class of a package, without importing it."""
+    return any((each.__module__ or "").partition(".")[0] == package for each in type(value).__mro__)
 
 
 def needed(package: str) -> Any:
@@ -32,21 +59,25 @@ def needed(package: str) -> Any:
         ) from None
 
 
-def of_formulas(
-    formulas: Mapping[str, str], parameters: Mapping[str, float], time: Mapping[str, Any]
+def system_of(
+    images: Images, parameters: dict[str, float], step: float | None, substeps: Any
 ) -> System:
-    """Return a map, or a differential equation where a time says so."""
-    if time:
-        return OdeSystem(derivative=dict(formulas), parameters=dict(parameters), **time)
-    return MapSystem(next=dict(formulas), parameters=dict(parameters))
+    """Return a system of formulas; where these say too little, warn, and return one of a function.
 
-
-def of_time(step: float | None, substeps: Any) -> dict[str, Any]:
-    """Return the keys of a differential equation that are given."""
-    given = {"step": step, "substeps": substeps}
+    A map; with ``step`` the images are derivatives.
+    """
     if step is None and substeps is not None:
         raise BadInput("a map has no substeps; give the step of a differential equation", "step")
-    return {key: value for key, value in given.items() if value is not None}
+    given = {"step": step, "substeps": substeps}
+    time = {key: value for key, value in given.items() if value is not None}
+    try:
+        formulas = dict(zip(images.states, images.write(), strict=True))
+        require_size(formulas, images.names)
+    except Untranslatable as why:
+        return _of_function(images.call(), images.states, parameters, time, str(why))
+    if time:
+        return OdeSystem(derivative=formulas, parameters=parameters, **time)
+    return MapSystem(next=formulas, parameters=parameters)
 
 
 def require_size(formulas: Mapping[str, str], names: Sequence[str]) -> None:
@@ -64,10 +95,10 @@ def require_size(formulas: Mapping[str, str], names: Sequence[str]) -> None:
             raise Untranslatable(f"formulas that it refuses ({error})") from None
 
 
-def of_function(
+def _of_function(
     field: Callable[..., Mapping[str, Any]],
     states: Sequence[str],
-    parameters: Mapping[str, float],
+    parameters: dict[str, float],
     time: Mapping[str, Any],
     why: str,
 ) -> System:
@@ -76,18 +107,16 @@ def of_function(
         f"formulas have no place for {why}: the function is called as it is, so the problem is "
         "solved as usual, but cannot be written to a file, and nothing can be enclosed",
         UserWarning,
-        stacklevel=3,
+        stacklevel=4,
     )
     step, substeps = time.get("step"), time.get("substeps", 1)
     if step is None:
-        return FunctionSystem(next=field, parameters=dict(parameters))
+        return FunctionSystem(next=field, parameters=parameters)
     if not isinstance(substeps, int):
         raise BadInput(f"a function needs a number of substeps, not {substeps!r}", "substeps")
     OdeSystem(derivative={}, step=step, substeps=substeps)  # refuses what is no time
-    return FunctionSystem(
-        next=RungeKuttaOfFunction(field, tuple(states), step, substeps),
-        parameters=dict(parameters),
-    )
+    method = RungeKuttaOfFunction(field, tuple(states), step, substeps)
+    return FunctionSystem(next=method, parameters=parameters)
 
 
 class RungeKuttaOfFunction:
@@ -105,20 +134,13 @@ class RungeKuttaOfFunction:
 
     def __call__(self, **values: Any) -> dict[str, Any]:
         """Return the states after the step."""
-        h, x = self.h, self._of(values)
-        for _ in range(self.substeps):
-            k1 = self._slope(values, x)
-            k2 = self._slope(values, [a + h / 2 * k for a, k in zip(x, k1, strict=True)])
-            k3 = self._slope(values, [a + h / 2 * k for a, k in zip(x, k2, strict=True)])
-            k4 = self._slope(values, [a + h * k for a, k in zip(x, k3, strict=True)])
-            x = [
-                a + h / 6 * (k + 2 * m + 2 * n + o)
-                for a, k, m, n, o in zip(x, k1, k2, k3, k4, strict=True)
-            ]
-        return dict(zip(self.states, x, strict=True))
 
-    def _of(self, values: Mapping[str, Any]) -> list[Floats]:
-        return [np.asarray(values[name], dtype=np.float64) for name in self.states]
+        def slope(x: Sequence[Floats]) -> tuple[Floats, ...]:
+            return self._of(self.field(**{**values, **dict(zip(self.states, x, strict=True))}))
 
-    def _slope(self, values: Mapping[str, Any], x: Sequence[Floats]) -> list[Floats]:
-        return self._of(self.field(**{**values, **dict(zip(self.states, x, strict=True))}))
+        for substep in rk4(slope, self._of(values), self.h, self.substeps):
+            end = substep.end
+        return dict(zip(self.states, end, strict=True))
+
+    def _of(self, values: Mapping[str, Any]) -> tuple[Floats, ...]:
+        return tuple(np.asarray(values[name], dtype=np.float64) for name in self.states)
