@@ -5,12 +5,12 @@ than a free cell may be near, at least LOOKS times a cell, and the time of an ev
 bisection. So what a simulation says of paths rests on no step that the model was compiled with.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lmdsl.common.types import Bools, Floats, Guard, Indices, Statuses
+from lmdsl.common.types import Bools, Floats, Guard, Statuses
+from lmdsl.control.steps import Moved
 from lmdsl.machine.kernels import fixed, kernel
 from lmdsl.model.assembly.paths.arcs import free_room
 from lmdsl.model.grid.axis import on_circle, on_interval
@@ -24,29 +24,8 @@ HALVINGS = 40  # of the time between the last place without an event and the fir
 SAFETY = 1.5  # speed on an arc at most, in parts of the largest at its stages
 
 
-class Moved(NamedTuple):
-    """Where runs are after a step.
-
-    Attributes
-    ----------
-    state
-        Wrapped, and clipped where that is declared; of the first event, or the end; shape (r, d).
-    cell
-        Of the first event, or of the end; -1 outside; shape (r,).
-    cost
-        What the step cost, without the terminal cost, shape (r,).
-    drawn
-        States within the step, not wrapped, shape (pieces, r, d); after an event, where that was.
-    """
-
-    state: Floats
-    cell: Indices
-    cost: Floats
-    drawn: Floats
-
-
 class Integrator:
-    """Moves runs by a sampling time of the equation that a problem declares.
+    """Steps of the equation that a problem declares, a sampling time each.
 
     Parameters
     ----------
@@ -81,25 +60,12 @@ class Integrator:
         end = self.flow(self._true_map.named(list(x.T), list(u.T), w), guard)
         return np.ascontiguousarray(end[: self.partition.dimension].T)
 
-    def move(
-        self,
-        x: Floats,
-        u: Floats,
-        w: Sequence[Floats],
-        guard: Guard | None = None,
-        absorb: bool = True,
-        pieces: int = 0,
-    ) -> Moved:
-        """Move runs from states (r, d) under controls (r, p) and noise, one (r,) a variable.
-
-        With ``absorb`` a run ends where it enters the attractor. ``pieces`` states are wanted from
-        within the step, at equal distances in time.
-        """
-        held = self._true_map.named(list(x.T), list(u.T), w)
-        watch = _Watch(self, len(x), absorb, pieces)
+    def move(self, values: Mapping[str, Floats], guard: Guard, absorb: bool, pieces: int) -> Moved:
+        """See :meth:`lmdsl.control.steps.Steps.move`."""
+        count, d = len(values[self.partition.names[0]]), self.partition.dimension
+        watch = _Watch(self, count, absorb, pieces)
         needed = self.judged or pieces
-        end = self.flow(held, guard, watch if needed else None)
-        d = self.partition.dimension
+        end = self.flow(values, guard, watch if needed else None)
         stopped = watch.cell >= -1
         final = np.ascontiguousarray(end[:d].T)
         state, cell = self.partition.enter(final)
@@ -108,7 +74,7 @@ class Integrator:
             state[stopped] = self.partition.states(on_way, clip=False)
             cell[stopped] = watch.cell[stopped]
             end[:, stopped] = watch.where[:, stopped]
-        integral = end[d] if len(end) > d else np.zeros(len(x))
+        integral = end[d] if len(end) > d else np.zeros(count)
         for piece in watch.drawn:
             open_ = np.isnan(piece).any(axis=1)
             piece[open_] = end[:d, open_].T

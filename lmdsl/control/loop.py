@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from lmdsl.common import inputs
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.control.controller import Controller
-from lmdsl.control.integration import Integrator, Moved
-from lmdsl.control.steps import CompiledSteps, Drawn
+from lmdsl.control.integration import Integrator
+from lmdsl.control.steps import CompiledSteps, Drawn, Moved, Steps
 from lmdsl.errors import BadInput
 from lmdsl.formulas.program import Program
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
@@ -117,7 +117,7 @@ class ClosedLoop:
         return ClosedLoop(self.problem, self.controller, self.status, True)
 
     @cached_property
-    def steps(self) -> Integrator | CompiledSteps:
+    def steps(self) -> Steps:
         """What makes the steps."""
         if self.as_compiled or self.problem.flow() is None:
             return CompiledSteps(self.true_map)
@@ -156,11 +156,12 @@ class ClosedLoop:
         absorb: bool = True,
         pieces: int = 0,
     ) -> Moved:
-        """Make a step; see :meth:`Integrator.move`. Its cost is without the terminal cost."""
+        """Make a step; see :meth:`Steps.move`. Its cost is without the terminal cost."""
         u, w = self.controller.at(cell, x), self.noise(rng, len(x))
+        values = self.true_map.named(list(x.T), list(u.T), w)
         guard = partial(deadline.raise_if_over, "simulating")
         if self.draws is None:
-            moved = self.steps.move(x, u, w, guard, absorb, pieces)
+            moved = self.steps.move(values, guard, absorb, pieces)
         else:
             guard()
             index = np.where(cell >= 0, self.controller.index[cell], -1).astype(np.int64)
@@ -169,10 +170,9 @@ class ClosedLoop:
             moved = Moved(place, after, self.draws.costs(cell, index), np.zeros((0, *x.shape)))
         if self._stage is None:
             return moved
-        named = self.true_map.named(list(x.T), list(u.T), w)
         given = 0.0 if self.draws is None else moved.cost
         try:
-            (stage,) = self._stage(named, guard)
+            (stage,) = self._stage(values, guard)
         except NotStored:  # only a saved result is at hand: the runs are known, their costs not
             stage = np.array(np.nan)
         return moved._replace(cost=given + np.broadcast_to(stage, len(x)))

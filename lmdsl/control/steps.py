@@ -1,11 +1,11 @@
 """Steps of the map as it is declared or compiled, and the noise of a step."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Guard
-from lmdsl.control.integration import Moved
+from lmdsl.common.types import Floats, Guard, Indices
 from lmdsl.machine.forking import cached_property
 from lmdsl.model.assembly.entries import integrated
 from lmdsl.model.assembly.paths.judging import PathJudge
@@ -33,6 +33,42 @@ class Drawn:
         return list(self.nodes.values[node].T)
 
 
+class Moved(NamedTuple):
+    """Where runs are after a step.
+
+    Attributes
+    ----------
+    state
+        Wrapped, and clipped where that is declared; of the first event, or the end; shape (r, d).
+    cell
+        Of the first event, or of the end; -1 outside; shape (r,).
+    cost
+        What the step cost, without the terminal cost, shape (r,).
+    drawn
+        States within the step, not wrapped, shape (pieces, r, d); after an event, where that was.
+    """
+
+    state: Floats
+    cell: Indices
+    cost: Floats
+    drawn: Floats
+
+
+class Steps(Protocol):
+    """Makes the steps of runs."""
+
+    @property
+    def method(self) -> str:
+        """How they are made, in words."""
+
+    def move(self, values: Mapping[str, Floats], guard: Guard, absorb: bool, pieces: int) -> Moved:
+        """Move runs from states, under controls and noise: named arrays of shape (r,).
+
+        With ``absorb`` a run ends where it enters the attractor. ``pieces`` states are wanted from
+        within the step of an equation, at equal distances in time.
+        """
+
+
 class CompiledSteps:
     """A map has no other steps; of a differential equation, what the compiled model is made of."""
 
@@ -42,7 +78,7 @@ class CompiledSteps:
 
     @property
     def method(self) -> str:
-        """How images are made, in words."""
+        """See :attr:`Steps.method`."""
         flow = self.problem.flow()
         if flow is None:
             return AS_DECLARED
@@ -58,21 +94,13 @@ class CompiledSteps:
         on, until = (PathJudge(flow, self.partition, sets, endpoint, a) for a in (False, True))
         return on, until
 
-    def move(
-        self,
-        x: Floats,
-        u: Floats,
-        w: Sequence[Floats],
-        guard: Guard | None = None,
-        absorb: bool = True,
-        pieces: int = 0,
-    ) -> Moved:
-        """See :meth:`lmdsl.control.integration.Integrator.move`; nothing is drawn of a map."""
-        cost, drawn = np.zeros(len(x)), np.zeros((0, *x.shape))
+    def move(self, values: Mapping[str, Floats], guard: Guard, absorb: bool, pieces: int) -> Moved:
+        """See :meth:`Steps.move`; nothing is drawn within a step."""
+        count = len(values[self.partition.names[0]])
+        cost, drawn = np.zeros(count), np.zeros((0, count, self.partition.dimension))
         if self._judges is None:
-            return Moved(*self.true_map.step(x, u, w, guard), cost, drawn)
-        values = self.true_map.named(list(x.T), list(u.T), w)
-        ends = self._judges[absorb](values, (len(x),), guard or (lambda: None), True)
+            return Moved(*self.true_map.step(values, guard), cost, drawn)
+        ends = self._judges[absorb](values, (count,), guard, True)
         cell = np.where(ends.cell >= 0, ends.cell, -1).astype(np.int64)
         state = self.partition.states(np.ascontiguousarray(ends.place.T))
         return Moved(state, cell, ends.integral if len(ends.integral) else cost, drawn)

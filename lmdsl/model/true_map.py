@@ -1,6 +1,6 @@
 """The true map x+ = T(x, u, w) of a problem, and the states and cells that its images become."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -60,12 +60,17 @@ class TrueMap:
         self, x: Floats, u: Floats, w: Sequence[Floats], guard: Guard | None = None
     ) -> Floats:
         """Return the images of states (r, d) under controls (r, p), not wrapped, shape (r, d)."""
-        return np.stack(
-            [np.broadcast_to(y, len(x)) for y in self(list(x.T), list(u.T), w, guard)], axis=-1
-        )
+        return self._images(self.named(list(x.T), list(u.T), w), guard)
 
     def step(
-        self, x: Floats, u: Floats, w: Sequence[Floats], guard: Guard | None = None
+        self, values: Mapping[str, Floats], guard: Guard | None = None
     ) -> tuple[Floats, Indices]:
-        """Return the next states, wrapped or clipped, shape (r, d), and their cells, -1 outside."""
-        return self.partition.enter(self.images(x, u, w, guard))
+        """Return the next states, wrapped or clipped, shape (r, d), and their cells, -1 outside.
+
+        ``values`` are named arrays of shape (r,).
+        """
+        return self.partition.enter(self._images(values, guard))
+
+    def _images(self, values: Mapping[str, Floats], guard: Guard | None) -> Floats:
+        count = len(values[self.names[0]])
+        return np.stack([np.broadcast_to(y, count) for y in self.map(values, guard)], axis=-1)

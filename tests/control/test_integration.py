@@ -36,7 +36,8 @@ def moved(data, x, u, absorb=True, pieces=0):
     lp = lm.compile(problem)
     integrator = Integrator(TrueMap(lp.problem, lp.partition), lp.cell_status)
     x, u = np.array(x, dtype=float), np.array(u, dtype=float)
-    return integrator.move(x, u, [], absorb=absorb, pieces=pieces), lp
+    values = dict(zip(("x", "v", "u"), (*x.T, *u.T), strict=True))
+    return integrator.move(values, lambda: None, absorb, pieces), lp
 
 
 def test_events_end_a_step_where_they_happen():

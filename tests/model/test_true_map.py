@@ -72,7 +72,9 @@ def test_images_wrap_and_clip(on_exit):
     x = np.array([[0.25, 0.75], [4.0, 0.0], [np.nan, 0.0], [-0.5, 1e9]])
     given = problem({"kind": "map", "next": {"x": "x*a + 0*b", "y": "y + w"}}, on_exit=on_exit)
     step = TrueMap(given, Partition.of(given)).step
-    states, cells = step(x, np.ones((4, 2)), [np.full(4, 0.5)])
+    states, cells = step(
+        {"x": x[:, 0], "y": x[:, 1], "a": np.ones(4), "b": np.ones(4), "w": np.full(4, 0.5)}
+    )
     clipped = on_exit == "clip"
     np.testing.assert_array_equal(states[:2], [[0.25, -0.75], [1.0 if clipped else 4.0, 0.5]])
     assert cells.tolist() == [8, 15 if clipped else -1, -1, -1]
