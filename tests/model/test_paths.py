@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from random_problems import _attempt
+from random_problems import attempt
 
 import lmdsl as lm
 from lmdsl.model.assembly.sampler import Block, Sampler
@@ -118,7 +118,7 @@ def test_what_is_skipped_is_free(seed):
 
     So is that of looking at a few samples at a time.
     """
-    data = _attempt(np.random.default_rng(seed))
+    data = attempt(np.random.default_rng(seed))
     if data["system"]["kind"] != "ode" or data["system"].get("judged") == "endpoint":
         return
     problem = lm.Problem(**data)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from random_problems import CORNER_CASES, describe, random_problem
 from reference import (
+    Arrays,
     Axis,
     ReferenceModel,
-    _Arrays,
-    _classify,
+    classify,
     compile_reference,
     solve_reference,
 )
@@ -99,7 +99,7 @@ def test_a_linear_program_finds_the_same_cost(drawn):
         solution = solve_reference(model)
         if solution.status != "ok" or max(solution.V.values()) > 1e4:
             continue
-        a = _Arrays(model)
+        a = Arrays(model)
         E = np.zeros((a.K, a.n))
         for k, (cell, _) in enumerate(a.pairs):
             E[k, a.index[cell]] = 1.0
@@ -142,7 +142,7 @@ def tiny_model(rng):
         if escaped == 0:
             model.admissible.add(pair)
             model.cost[pair] = float(rng.choice([0, 0, 1, 2, 0.375]))
-    _classify(model)
+    classify(model)
     return model
 
 

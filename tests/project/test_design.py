@@ -184,13 +184,27 @@ def test_public_parameters_are_documented(name, item):
         assert parameter in text, f"{name} does not document {parameter}"
 
 
+def imported_by(path):
+    """The names of the packages that a file imports."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+        names += [str(node.module)] if isinstance(node, ast.ImportFrom) else []
+        yield from (name.split(".")[0] for name in names)
+
+
 def test_the_checker_of_certificates_stands_alone():
     script = PACKAGE.parent / "tools/check_certificate.py"
     assert len(script.read_text().splitlines()) < 210
-    for node in ast.walk(ast.parse(script.read_text())):
-        names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-        names += [str(node.module)] if isinstance(node, ast.ImportFrom) else []
-        assert {name.split(".")[0] for name in names} <= set(sys.stdlib_module_names)
+    assert {*imported_by(script)} <= set(sys.stdlib_module_names)
+
+
+def test_the_reference_shares_no_code():
+    known = {"numpy", "scipy", "reference", *sys.stdlib_module_names}
+    files = [*Path(PACKAGE.parent / "tests/helpers/reference").glob("*.py")]
+    assert len(files) > 10
+    for path in files:
+        assert {*imported_by(path)} <= known, path.name
+        assert len(path.read_text().splitlines()) <= 320, path.name
 
 
 def test_no_file_is_too_long():
