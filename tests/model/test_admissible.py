@@ -75,3 +75,35 @@ def test_the_cause_is_said_in_words():
 def test_hints_try_admissible_controls_only():
     problem = made(steps(admissible="u < 1"))  # no hint: the control that helps is not admissible
     assert not [hint for hint in lm.explain(problem).hints if hint.kind == "finer grid"]
+
+
+def gliding(**more):
+    """x' = u from 0 to 10 by steps of 2 cells; A is [0, 1]."""
+    data = steps(system={"kind": "ode", "derivative": {"x": "u"}, "step": 2.0}, **more)
+    data["state_box"] = {"x": {"low": 0, "high": 10, "cells": 10}}
+    data["control_grid"] = {"u": {"values": [-1, 1]}}
+    return data
+
+
+@pytest.mark.parametrize("judged", ["path", "endpoint"])
+def test_the_way_of_a_step_is_not_judged(judged):
+    """Of all that x meets only where a sample begins counts; a set to avoid is met on the way."""
+    data = gliding(admissible="x < 4 or x > 5")
+    data["system"]["judged"] = judged
+    plain = {**data, "admissible": "x < 99"}
+    assert pairs(made(plain)) - pairs(made(data)) == {(4, 0), (4, 1)}
+    avoided = {**plain, "avoid": {"boxes": [{"x": [4, 5]}]}}
+    passing = {(5, 0), (3, 1)} if judged == "path" else set()  # from 5 to 3, and back
+    ending = {(6, 0), (2, 1)}
+    assert pairs(made(data)) - pairs(made(avoided)) == passing | ending
+
+
+def test_between_samples_and_in_runs_nothing_is_judged():
+    """The condition fails at 0.55, which no sample meets; runs go through it."""
+    spared = made(steps(admissible="abs(x - 0.5) > 0.06 or u < 1"))
+    assert pairs(spared) == pairs(made(steps()))
+    found = lm.solve(spared)
+    assert found.status == "verified"
+    assert found.simulate(500, 9).reached == 500
+    cornered = {"kind": "grid", "per_axis": 2, "corners": True}
+    assert (2, 1) not in pairs(spared.replaced(sampling=cornered))
