@@ -9,9 +9,10 @@ import numpy as np
 from lmdsl.advice.report import Finding
 from lmdsl.advice.survey import Survey
 from lmdsl.common.types import Bools, Floats, Indices
+from lmdsl.control.accuracy import TOO_MUCH, integration_error
 from lmdsl.explanation import remedies
 from lmdsl.machine.deadline import Deadline
-from lmdsl.model.assembly.substeps import integration_error, settled
+from lmdsl.model.assembly.substeps import needed
 from lmdsl.model.grid.partition import MAX_CELLS, Partition
 
 STUCK = 0.05  # share of cells tried that keep their samples from which on a step is too short
@@ -148,19 +149,20 @@ def few_substeps(survey: Survey, deadline: Deadline) -> Iterator[Finding]:
     """Find that the Runge-Kutta steps miss the differential equation, and how many do not."""
     if survey.sets is None:
         return
-    error = integration_error(survey.problem, survey.sets.free, deadline)
+    error = integration_error(survey.problem, survey.sets, deadline)
     if error is None or not error.excessive:
         return
-    system: Any = survey.problem.system
-    auto = survey.problem.replaced(system=system.replaced(substeps="auto"))
-    needed: Any = settled(auto, deadline).system
-    missed = max(error.halving or 0.0, error.accurate or 0.0)
-    text = (
-        f"with {_count(error.substeps, 'substep')} the steps are up to {missed:.2g} widths of a "
-        "cell from the differential equation (99 % quantile), so that the answer is not about it"
-    )
-    remedy = f'write "substeps": "auto" in system, which makes them {needed.substeps}'
-    figures = {"substeps": error.substeps, "widths": missed, "substeps_needed": needed.substeps}
+    text, enough = error.fault(), needed(survey.problem, deadline)
+    if TOO_MUCH < error.largest < np.inf:
+        text = (
+            f"the steps are up to {error.largest:.2g} widths of a cell from the differential "
+            "equation (99 % quantile), so that the answer is not about it"
+        )
+    figures = {"substeps": error.substeps, "widths": error.largest, "substeps_needed": enough}
+    remedy = error.remedy()
+    if enough > error.substeps:
+        remedy = f'write "substeps": "auto" in system, which makes them {enough}'
+    text = f"with {_count(error.substeps, 'substep')} {text}"
     yield Finding("few_substeps", "system.substeps", text, remedy, figures)
 
 

@@ -16,7 +16,7 @@ from lmdsl.model.assembly.paths.arcs import free_room
 from lmdsl.model.grid.axis import on_circle, on_interval
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
-from lmdsl.systems.accurate import AccurateFlow, Arc, place, places
+from lmdsl.systems.accurate import ATTEMPTS, AccurateFlow, Arc, place, places
 
 LOOKS = 32  # places of a path for each cell width that it covers, where an event may be near
 LEAST_PART = 1e-5  # of an arc between two places
@@ -33,13 +33,17 @@ class Integrator:
         That of a problem with a differential equation.
     status
         What every cell is, shape (N,); None where nothing on the way is an event.
+    attempts
+        Steps of a run above which it is given up.
     """
 
-    def __init__(self, true_map: TrueMap, status: Statuses | None = None) -> None:
+    def __init__(
+        self, true_map: TrueMap, status: Statuses | None = None, attempts: int = ATTEMPTS
+    ) -> None:
         problem, partition = true_map.problem, true_map.partition
         flow = problem.flow()
         assert flow is not None
-        self.flow, self.partition = AccurateFlow(flow, partition.width), partition
+        self.flow, self.partition = AccurateFlow(flow, partition.width, attempts), partition
         self._true_map = true_map
         self.status, self._room = status, np.zeros(0, dtype=np.uint8)
         self.judged = status is not None and problem.judged == "path"

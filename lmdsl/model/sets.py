@@ -67,9 +67,13 @@ class CellSets:
         if len(both):
             cell = boxes.named(partition, int(both[0]))
             raise BadInput(f"{cell} is both attractor and avoid; shrink one of them", "avoid")
-        mass = _mass(problem, partition, guard)
+        return cls.made(attractor, avoid, _mass(problem, partition, guard))
+
+    @classmethod
+    def made(cls, attractor: Bools, avoid: Bools, mass: Floats) -> Self:
+        """Return the sets of masks that are known."""
         free = np.flatnonzero(~attractor & ~avoid)
-        number = np.full(partition.size, -1, dtype=np.int32)
+        number = np.full(len(attractor), -1, dtype=np.int32)
         number[free] = np.arange(len(free), dtype=np.int32)
         number[attractor] = len(free)
         return cls(attractor, avoid, mass, free, number)

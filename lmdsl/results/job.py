@@ -11,15 +11,15 @@ from lmdsl.backends import Backend, Solution
 from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Certificate, Verified, Witness
 from lmdsl.common.types import Floats
+from lmdsl.control.accuracy import IntegrationError, integration_error
 from lmdsl.control.invariance import examine
 from lmdsl.data.report import DataReport
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
-from lmdsl.model.assembly.substeps import IntegrationError, integration_error
 from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.sets import attractor_note
+from lmdsl.model.sets import CellSets, attractor_note
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.results.polishing import _Outcome
@@ -151,9 +151,10 @@ class _Job:
         """Judge the compiled steps, where there is time."""
         try:
             lp = self.lp
-            given = np.isin(lp.cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID))
-            free = np.flatnonzero(~given)
-            return integration_error(lp.problem, free, self.finish)
+            attractor = lp.cell_status == CellStatus.ATTRACTOR
+            avoid = lp.cell_status == CellStatus.AVOID
+            sets = CellSets.made(attractor, avoid, np.ones(lp.partition.size))
+            return integration_error(lp.problem, sets, self.finish)
         except TimeLimitReached:
             return None
 

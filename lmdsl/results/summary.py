@@ -7,10 +7,10 @@ import numpy as np
 
 from lmdsl.common.records import Frozen, Reported, jsonable
 from lmdsl.common.types import Statuses
+from lmdsl.control.accuracy import IntegrationError
 from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.simulation import Simulation
 from lmdsl.data.report import DataReport
-from lmdsl.model.assembly.substeps import IntegrationError
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.results.status import Status

@@ -21,7 +21,7 @@ from lmdsl.systems.runge_kutta import RungeKutta
 
 TOLERANCE = 1e-9
 FINER, MOST_STEPS = 16, 16_000  # fixed steps: as many for each declared one; in all
-ATTEMPTS = 20_000  # steps of a run above which it counts as not to be integrated
+ATTEMPTS = 20_000  # steps of a run above which it is given up
 SHORTEST = 1e-12  # length of a step, in parts of the sampling time, below which that holds too
 CHUNK = 8192  # runs integrated at a time
 
@@ -143,10 +143,12 @@ class AccurateFlow:
         The equation, and what is integrated along with it.
     width
         Cell widths, the unit of errors, shape (d,).
+    attempts
+        Steps of a run above which it is given up.
     """
 
-    def __init__(self, flow: RungeKutta, width: Floats) -> None:
-        self.flow, self.width = flow, width
+    def __init__(self, flow: RungeKutta, width: Floats, attempts: int = ATTEMPTS) -> None:
+        self.flow, self.width, self.attempts = flow, width, attempts
         self.smooth = not has_kinks(flow.field, flow.states)
         self.outputs = len(flow.field.formulas)
         self.step = flow.h * flow.substeps
@@ -162,7 +164,9 @@ class AccurateFlow:
     def __call__(
         self, values: Mapping[str, Floats], guard: Guard | None = None, watch: Watch | None = None
     ) -> Floats:
-        """Return where runs end, and integrals, shape (n, r); NaN where nothing integrates them.
+        """Return where runs end, and integrals, shape (n, r).
+
+        NaN where nothing integrates them; infinite where they are given up.
 
         ``values`` are arrays of shape (r,). ``watch`` is told every arc of every run and returns
         which of its rows go no further; what is returned of these is where the arc ends.
@@ -205,7 +209,7 @@ class AccurateFlow:
         table = _table()
         slope, time = runs.slope(runs.state), np.zeros(len(runs.rows))
         h = np.full(len(runs.rows), self.step)
-        for _ in range(ATTEMPTS):
+        for _ in range(self.attempts):
             last = h >= self.step - time
             length = np.where(last, self.step - time, h)
             stages = np.empty((13, *runs.state.shape))
@@ -234,6 +238,7 @@ class AccurateFlow:
                 slope, time, h = slope[:, on], time[on], h[on]
             if not len(runs.rows):
                 return
+        end[:, runs.rows] = np.inf
 
     def _arc(
         self,

@@ -65,7 +65,7 @@ class Entries:
         found = images(values)
         place = np.stack([np.broadcast_to(image, shape).ravel() for image in found])
         index = np.broadcast_to(self.partition.index(found), shape)
-        return Endings(np.ascontiguousarray(index), place, np.empty(0))
+        return Endings(np.ascontiguousarray(index), place, np.empty(0), np.empty(0))
 
     def costs(self, ends: Endings, guard: Guard) -> dict[str, Floats]:
         """Return by key what samples pay besides a stage cost, in their shape."""

@@ -36,11 +36,14 @@ class Endings(NamedTuple):
     integral
         Integral of the cost rate until then, NaN where the rate was negative or not a number on
         the way; shape (samples,), or (0,) without a rate.
+    time
+        When that is, in Runge-Kutta steps from the start, shape (samples,); (0,) of a map.
     """
 
     cell: Floats
     place: Floats
     integral: Floats
+    time: Floats
 
 
 def path_doubles(flow: RungeKutta) -> int:
@@ -111,7 +114,23 @@ class PathJudge:
 
         place = joined([half.place for half in halves], len(halves[0].place))
         integral = joined([half.integral for half in halves], self.flow.integrals).ravel()
-        return Endings(cell, place, integral)
+        return Endings(cell, place, integral, joined([half.time for half in halves], 1).ravel())
+
+    def until(self, values: Mapping[str, Floats], time: Floats, guard: Guard) -> Floats:
+        """Return the integral of samples, given by (r,) arrays, until a time of each, shape (r,).
+
+        Times are above 0, in Runge-Kutta steps.
+        """
+        integral, most = np.empty(len(time)), max(1, self.most)
+        arc = np.clip(np.ceil(time).astype(np.int64) - 1, 0, self.flow.substeps - 1)
+        for first in range(0, len(time), most):
+            some = slice(first, first + most)
+            held = {name: x[some] for name, x in values.items()}
+            knots = self._knots(held, time[some].shape, guard)
+            begun = arc[some]
+            arcs.integrals(*knots, self.partition.dimension, begun, time[some] - begun,
+                           integral[some])  # fmt: skip
+        return integral
 
     def _judged(
         self, values: Mapping[str, Floats], shape: tuple[int, ...], guard: Guard, places: bool
@@ -131,7 +150,7 @@ class PathJudge:
         arcs.places(state, slope, arc, time, place)
         if integrals:
             arcs.integrals(state, slope, rate, d, arc, time, integral)
-        return Endings(cell.reshape(shape), place, integral)
+        return Endings(cell.reshape(shape), place, integral, arc + time)
 
     def _knots(
         self, values: Mapping[str, Floats], shape: tuple[int, ...], guard: Guard
