@@ -1,5 +1,6 @@
 """What pydantic finds wrong, as one line: every fault with its path, the value and the fix."""
 
+import inspect
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from types import UnionType
@@ -36,6 +37,10 @@ _FIXES = {
     "tuple_type": "write a list in brackets",
 }
 
+FUNCTIONS = (
+    "write formulas as text: only stage_cost and next of lm.systems.FunctionSystem may be "
+    "functions, of a differential equation one that integrates a step"
+)
 _ADD = "required key is missing; add it"
 
 
@@ -108,6 +113,8 @@ def _fault(item: Mapping[str, Any], model: type[BaseModel]) -> _Fault:
     fix = _FIXES.get(kind)
     if location[-1:] == ("[key]",):
         fix = "names are strings"
+    if inspect.isroutine(item["input"]):
+        return _Fault(where, f"a Python function is not accepted here; {FUNCTIONS}")
     limits = {key: _plain(value) for key, value in item.get("ctx", {}).items()}
     fix = fix.format(**limits) if fix else item["msg"]
     return _Fault(where, f"{written(item['input'])} is not accepted; {fix}")
@@ -146,6 +153,9 @@ def _plain(value: Any) -> Any:
 
 
 def _unknown(where: str, location: tuple[int | str, ...], model: type[BaseModel]) -> _Fault:
+    for kind in _models(model, location[:-1]):
+        if said := getattr(kind, "elsewhere", {}).get(location[-1]):
+            return _Fault(where, said)
     allowed = sorted({key for kind in _models(model, location[:-1]) for key in kind.model_fields})
     near = spelling.nearest(str(location[-1]), allowed, spelling.KEYS)
     if near is None and "kind" not in allowed:  # of several forms, another one

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
@@ -124,6 +124,9 @@ class Declared(BaseModel, metaclass=_Meta):
     model_config = ConfigDict(
         extra="forbid", strict=True, frozen=True, arbitrary_types_allowed=True
     )
+
+    # Keys that have their place in other models, and what to say of one here.
+    elsewhere: ClassVar[Mapping[str, str]] = {}
 
     def replaced(self, **changes: Any) -> Self:
         """Return a copy with some keys changed, validated anew."""

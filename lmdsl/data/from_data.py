@@ -167,6 +167,8 @@ def _transitions(problem: Problem, x: Any, u: Any, x_next: Any) -> Recording:
             _array(x_next, states, "x_next"),
         ]
     T = 0 if parts[0] is None else len(parts[0])
+    if not T:
+        raise BadInput("no transition is given; record at least one", "x")
     whole = [np.zeros((T, 0)) if part is None else part for part in parts]
     for part, name in zip(whole, ("x", "u", "x_next"), strict=True):
         if len(part) != T:

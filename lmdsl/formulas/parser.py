@@ -17,7 +17,7 @@ from lmdsl.formulas.operations import (
     FORMULA_FUNCTIONS,
     OPERATIONS,
 )
-from lmdsl.formulas.tokens import Token, fault_at
+from lmdsl.formulas.tokens import Token, UndeclaredName, fault_at
 
 MAX_CHARACTERS: Final = 4_000
 MAX_NODES: Final = 1_000
@@ -235,7 +235,8 @@ class Parser:
             text, [*declared, *FORMULA_FUNCTIONS, *FORMULA_CONSTANTS], tokens.HABITS
         )
         fault = f"{shown(text)} is not a declared name or function{hint or ';'}"
-        raise fault_at(start, f"{fault} {tokens.declared(declared)}")
+        listed = tokens.declared(declared)
+        raise UndeclaredName(f"character {start + 1}: {fault} {listed}", start, text)
 
     def _declared(self, text: str, start: int) -> Parsed:
         constant = None

@@ -3,7 +3,7 @@
 import keyword
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Final, NamedTuple
 
 from lmdsl.common import spelling
@@ -64,6 +64,14 @@ class FormulaError(BadInput):
     def __init__(self, message: str, position: int = 0, where: str = "") -> None:
         self.position = position
         super().__init__(message, where)
+
+
+class UndeclaredName(FormulaError):
+    """A formula with a name that has no value in it; ``name`` is that name."""
+
+    def __init__(self, message: str, position: int, name: str) -> None:
+        super().__init__(message, position)
+        self.name = name
 
 
 def fault_at(position: int, fault: str) -> FormulaError:
@@ -145,3 +153,34 @@ def declared(names: Iterable[str]) -> str:
     listed = sorted(names)
     shortened = ", ".join(listed[:20]) + ", ..." * (len(listed) > 20)
     return f"declared names are {shortened}" if shortened else "no names are declared"
+
+
+KINDS: Final = {"state": "a state", "control": "a control", "noise": "a noise variable"}
+_MANY: Final = {"state": "states", "control": "controls", "noise": "noise"}
+
+
+def elsewhere(
+    fault: UndeclaredName,
+    known: Mapping[str, Collection[str]],
+    kinds: Collection[str],
+    names: Collection[str],
+) -> str:
+    """Return what to say of a name that has a value in other formulas, if it has.
+
+    Parameters
+    ----------
+    fault
+        What is said of a name of which nothing is known.
+    known
+        The names of every kind.
+    kinds, names
+        The kinds and the names that have a value in this formula.
+    """
+    kind = next((kind for kind, of_kind in known.items() if fault.name in of_kind), None)
+    if kind is None:
+        return fault.message
+    *most, last = [*(_MANY[kind] for kind in known if kind in kinds), "parameters"]
+    return (
+        f"character {fault.position + 1}: {shown(fault.name)} is {KINDS[kind]}, which has no value "
+        f"here; this is a formula in {', '.join(most)} and {last}; {declared(names)}"
+    )

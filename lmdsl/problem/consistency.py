@@ -75,8 +75,9 @@ def _one_cost(problem: "Problem") -> None:
     if problem.stage_cost is not None:
         raise BadInput("stage_cost is given as well; keep one of them", "cost_rate")
     if not isinstance(problem.system, OdeSystem | NamedOde):
+        what = "finite model" if isinstance(problem.system, MatrixSystem) else "map"
         raise BadInput(
-            "a map has no time between its steps; write a stage_cost, or an ode", "cost_rate"
+            f"a {what} has no time between its steps; write a stage_cost, or an ode", "cost_rate"
         )
 
 

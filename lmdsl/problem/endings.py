@@ -26,8 +26,9 @@ def require_end(problem: "Problem") -> None:
             "there be none)",
             "attractor",
         )
-    if problem.local_controller is not None:
-        raise BadInput("there is no attractor cell to control; leave it out", "local_controller")
+    for key, verb in (("local_controller", "control"), ("terminal_cost", "enter")):
+        if getattr(problem, key) is not None:
+            raise BadInput(f"there is no attractor cell to {verb}; leave it out", key)
 
 
 def require_same_data(before: "Problem", after: "Problem") -> None:
@@ -59,6 +60,17 @@ def require_fit(problem: "Problem") -> None:
     for where in ("noise", "local_controller"):
         if getattr(problem, where) is not None:
             raise BadInput("a finite model has none; leave it out", where)
+    if problem.on_exit == "clip" and not isinstance(
+        system, DataSystem
+    ):  # data were moved while they were binned
+        raise BadInput(
+            "'clip' moves images into the box, and a finite model has rows instead; leave it out",
+            "on_exit",
+        )
+    if problem.sampling.count(problem.states) != 1 or problem.sampling.kind != "grid":
+        raise BadInput(
+            'a finite model is not sampled; write {"kind": "grid", "per_axis": 1}', "sampling"
+        )
     sure = isinstance(system, DataSystem) and system.confidence is not None
     if sure and problem.terminal_cost is not None:
         raise BadInput("the bounds of a confidence do not know it; leave one of them out",

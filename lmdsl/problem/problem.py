@@ -6,8 +6,8 @@ file (at most 16 MiB). Geometry is resolved later, in partition.py.
 
 import json
 import os
-from collections.abc import Collection
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Collection, Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -18,6 +18,7 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.language import Formula, defined, parse, parse_condition
 from lmdsl.formulas.names import FormulaText, Let
 from lmdsl.formulas.program import Program
+from lmdsl.formulas.tokens import UndeclaredName, elsewhere
 from lmdsl.problem import endings
 from lmdsl.problem.axes import StateBox
 from lmdsl.problem.consistency import require_consistent, require_writable
@@ -74,6 +75,17 @@ class Problem(Declared):
         With the path of the field, the value and the fix.
     """
 
+    elsewhere: ClassVar[Mapping[str, str]] = {
+        key: f"it is a key of {where}; move it there"
+        for where, keys in {
+            "system": ("step", "substeps", "judged", "next", "derivative", "parameters"),
+            "sampling": ("per_axis", "corners", "seed"),
+            "an axis of state_box": ("periodic", "cells"),
+            "attractor, avoid or measure": ("where", "boxes"),
+            "measure": ("density",),
+        }.items()
+        for key in keys
+    }
     format: Literal["lmdsl/1"] = "lmdsl/1"
     name: Annotated[str, Field(max_length=1000)] = ""
     system: SystemUnion
@@ -184,6 +196,9 @@ class Problem(Declared):
         definitions = self.names().definitions  # whose faults are not of this field
         try:
             return (parse_condition if condition else parse)(text, names, definitions)
+        except UndeclaredName as error:
+            usable = {*names, *(d for d in definitions if definitions[d].names <= names)}
+            raise BadInput(elsewhere(error, known, kinds, usable), where) from None
         except BadInput as error:
             raise BadInput(error.message, where) from None
 

@@ -32,6 +32,8 @@ Substeps = Annotated[
 ]
 UNSETTLED = 16  # substeps where as many as it takes are asked for, before these are known
 Judged = Literal["path", "endpoint"]
+OF_TIME = ("step", "substeps", "judged")
+NO_TIME = "a map has no time between its steps; leave it out, or declare an ode"
 
 
 class Names(NamedTuple):
@@ -153,6 +155,10 @@ class MapSystem(System):
         State name to the formula of its next value, in states, controls, noise and parameters.
     """
 
+    elsewhere: ClassVar[Mapping[str, str]] = {
+        **dict.fromkeys(OF_TIME, NO_TIME),
+        "derivative": "a map has no derivative; write the next states in next, or declare an ode",
+    }
     kind: Literal["map"] = "map"
     next: Formulas
 
@@ -177,6 +183,9 @@ class OdeSystem(System):
         ``endpoint``: only where a step ends.
     """
 
+    elsewhere: ClassVar[Mapping[str, str]] = {
+        "next": "an ode has no next states; write their derivative, or declare a map"
+    }
     kind: Literal["ode"] = "ode"
     derivative: Formulas
     step: Positive

@@ -5,14 +5,14 @@ arrays of doubles, and before and after a compilation it is asked the same quest
 """
 
 import inspect
-from collections.abc import Callable, Sequence
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from lmdsl.common.strict_model import plain
 from lmdsl.errors import BadInput
-from lmdsl.systems.base import Names, StateMap, System
+from lmdsl.systems.base import OF_TIME, Names, StateMap, System
 from lmdsl.systems.black_box.function_map import FunctionMap
 from lmdsl.systems.black_box.returned import Returned
 from lmdsl.systems.black_box.scalar_map import ScalarMap
@@ -48,6 +48,11 @@ class FunctionSystem(System):
     'function'
     """
 
+    elsewhere: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        (*OF_TIME, "derivative"),
+        "a FunctionSystem is a map: next returns the states one step on; integrate in it, or write "
+        "formulas with kind ode",
+    )
     kind: Literal["function"] = "function"
     next: Callable[..., Any] = Field(exclude=True)
     # How it is called changes nothing of what is compiled: no saved result says it.

@@ -11,7 +11,17 @@ from lmdsl.common.strict_model import Positive
 from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.language import NO_DEFINITIONS, Formula
 from lmdsl.formulas.operations import FORMULA_CONSTANTS, FORMULA_FUNCTIONS
-from lmdsl.systems.base import Judged, MapSystem, Names, OdeSystem, StateMap, Substeps, System
+from lmdsl.systems.base import (
+    NO_TIME,
+    OF_TIME,
+    Judged,
+    MapSystem,
+    Names,
+    OdeSystem,
+    StateMap,
+    Substeps,
+    System,
+)
 from lmdsl.systems.runge_kutta import RungeKutta
 
 
@@ -23,6 +33,10 @@ class NamedSystem(System):
     ``system``, which the other values say).
     """
 
+    elsewhere: ClassVar[Mapping[str, str]] = dict.fromkeys(
+        ("next", "derivative"),
+        "the formulas of a system known by name are fixed; leave it out, or write kind map or ode",
+    )
     kind: str
     defaults: ClassVar[Mapping[str, float]] = {}
     source: ClassVar[str] = ""
@@ -87,6 +101,11 @@ class NamedSystem(System):
 
 class NamedMap(NamedSystem):
     """A named discrete-time map; a subclass sets ``formulas``."""
+
+    elsewhere: ClassVar[Mapping[str, str]] = {
+        **NamedSystem.elsewhere,
+        **dict.fromkeys(OF_TIME, NO_TIME),
+    }
 
     def definition(self) -> MapSystem:
         """See :meth:`NamedSystem.definition`."""

@@ -84,7 +84,7 @@ def plain_rows(x, u, x_next, periodic):
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 2**32), st.booleans(), st.integers(0, 60), st.sampled_from([0.0, 0.5]))
+@given(st.integers(0, 2**32), st.booleans(), st.integers(1, 60), st.sampled_from([0.0, 0.5]))
 def test_rows_are_those_of_a_plain_count(seed, periodic, T, smoothing):
     rng = np.random.default_rng(seed)
     x = rng.uniform(-0.5, 3.4, (T, 2))
@@ -204,7 +204,9 @@ def test_what_is_refused(change, message):
 
 
 def test_no_data_is_no_fault_of_the_program():
-    result = lm.solve(lm.from_data([], [], [], **KEYS))
+    with pytest.raises(lm.BadInput, match=r"^x: no transition is given; record at"):
+        lm.from_data([], [], [], **KEYS)
+    result = lm.solve(lm.from_data([7.0], [0], [0.1], **KEYS))  # begins outside the box
     assert result.status == "not_stabilizable"
     assert "`support`" in result.message
     assert result.data.unseen is None

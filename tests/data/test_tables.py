@@ -163,5 +163,6 @@ def test_parquet_without_its_package_names_the_extra(tmp_path, monkeypatch):
 
 def test_a_table_without_transitions(tmp_path, recwarn):
     (tmp_path / "a.csv").write_bytes(b"x,u,x_next\n")
-    assert lm.from_data(tmp_path / "a.csv", **KEYS).system.recorded.transitions == 0
+    with pytest.raises(lm.BadInput, match=r"^x: no transition is given; record"):
+        lm.from_data(tmp_path / "a.csv", **KEYS)
     assert not recwarn.list

@@ -174,7 +174,7 @@ def test_a_rate_that_is_negative_on_the_way_is_refused():
     [
         ({"stage_cost": "1", "cost_rate": "1"}, "cost_rate: stage_cost is given as well"),
         ({"stage_cost": None}, "stage_cost"),
-        ({"terminal_cost": "u"}, "terminal_cost: .*'u' is not a declared name"),
+        ({"terminal_cost": "u"}, "terminal_cost: .*'u' is a control, which has no value here"),
         ({"terminal_cost": "x - 19"}, "terminal_cost: the terminal cost is -"),
     ],
 )

@@ -64,7 +64,7 @@ def test_one_way_in_which_formulas_are_parsed():
     assert problem.formula("far + x", "somewhere", ("state",)).names == {"x", "k"}
     assert problem.formula("half < 1", "somewhere", condition=True).names == {"u"}
     for text, kinds, says in [
-        ("u", ("state",), "somewhere: character 1: 'u' is not a declared name"),
+        ("u", ("state",), "somewhere: character 1: 'u' is a control, which has no value"),
         ("half", ("state",), "somewhere: character 1: 'half' depends on u, which has no value"),
         ("x < 1", ("state",), "comparison"),
     ]:
@@ -87,7 +87,7 @@ def test_one_way_in_which_formulas_are_parsed():
         ({"let": {f"a{k}": "x" for k in range(201)}}, "let", "200"),
         ({"measure": {"density": "half"}}, "measure.density", "'half' depends on u"),
         ({"attractor": {"where": "half < 1"}}, "attractor.where", "'half' depends on u"),
-        ({"attractor": {"where": "u < 1"}}, "attractor.where", "'u' is not a declared"),
+        ({"attractor": {"where": "u < 1"}}, "attractor.where", "'u' is a control"),
         ({"attractor": {"where": "x"}}, "attractor.where", "'x' is not a comparison"),
         ({"attractor": {"where": []}}, "attractor.where", "at least 1"),
         ({"attractor": {"where": ["x < 1", "x <"]}}, "attractor.where[1]", "ends"),
@@ -109,7 +109,7 @@ def test_one_way_in_which_formulas_are_parsed():
         ({"system": {"kind": "continuous"}}, "system.kind", "did you mean 'ode'?"),
         ({"system": {"kind": 7}}, "system.kind", "7 is not a kind; the kinds are map, ode, "),
         ({"system": "map"}, "system", "write an object with a kind: map, ode, "),
-        ({"system": {**SYSTEM, "derivative": {}}}, "system.derivative", "unknown key"),
+        ({"system": {**SYSTEM, "derivative": {}}}, "system.derivative", "a map has no derivative"),
         ({"attractor": {"boxes": [{"X": [0, 1]}]}}, "attractor.boxes[0]", "did you mean 'x'?"),
         ({"noise": {"w": {"gaussian": {"std": 1, "points": 3}}}}, "noise.w.gaussian", "'normal'"),
         ({"noise": {"w": {"normal": {"sigma": 1, "points": 3}}}}, "noise.w.normal.sigma", "'std'"),

@@ -249,11 +249,14 @@ def test_a_file_of_storm(tmp_path):
     ("1 : 0.3\n", "1 : 1e999999999\n", "is no number"),
     ("1 : 0.3\n", "1 : 1/0\n", "divides by 0"),
     ("1 : 0.3\n", "7 : 0.3\n", "there is no state 7; they are 0..2"),
-    ("1 : 0.3\n", "1 : 0.4\n", "state 0, action 0: the probabilities sum to"),
+    ("1 : 0.3\n", "1 : 0.4\n", "state 0 (init), action 0: the probabilities sum to"),
     ("state 1 ", "state 5 ", "state '5' where 1 is expected"),
     ("[1, 0.5]", "[1]", "1 rewards for 2 reward models"),
-    ("[1, 0.5]", "[1, -5]", "cost: state 0, action 0: -4.0; a cost is finite and >= 0"),
+    ("[1, 0.5]", "[1, -5]", "cost: state 0 (init), action 0: -4.0; a cost is finite and >= 0"),
     ("@model\n", "", "is not expected here"),
+    ("@nr_states\n3", "@nr_states\n4", "line 9: @nr_states says '4', but the file has 3 states"),
+    ("@nr_choices\n4", "@nr_choices\n5", "@nr_choices says '5', but the file has 4 choices"),
+    ("@nr_choices\n4", "@nr_choices\nmany", "@nr_choices says 'many', but the file has 4"),
 ])  # fmt: skip
 def test_bad_files_of_storm(old, new, words, tmp_path):
     path = tmp_path / "model.drn"

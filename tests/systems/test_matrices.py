@@ -206,6 +206,10 @@ def test_what_a_finite_model_has_no_place_for(tmp_path):
         ({"state_box": {"state": axis}}, "state_box: 3 cells; the matrices have 2"),
         ({"noise": noise}, "noise: a finite model has none"),
         ({"control_grid": {"action": {"values": [0, 1]}}}, "control_grid: 2 controls"),
+        ({"on_exit": "clip"}, "on_exit: 'clip' moves images into the box, and a finite model"),
+        ({"sampling": {"kind": "random", "points": 1}}, "sampling: a finite model is not sampled"),
+        ({"sampling": {"kind": "grid", "per_axis": 2}}, "sampling: a finite model is not sampled"),
+        ({"stage_cost": None, "cost_rate": "1"}, "cost_rate: a finite model has no time"),
     ):
         with pytest.raises(lm.BadInput, match=re.escape(words)):
             problem.replaced(**change)
@@ -225,7 +229,9 @@ def test_keys_of_a_problem_apply():
     more = problem.replaced(stage_cost="state + 10*action", terminal_cost="state*4", gamma=0.5)
     # V1 = 1 + 1 + 0.5*8, V0 = 1 + 0 + 0.5 V1
     assert lm.solve(more).value.tolist() == pytest.approx([4, 6, 0])
-    with pytest.raises(lm.BadInput, match="is not finite and >= 0"):
+    with pytest.raises(lm.BadInput, match=r"^stage_cost: the stage cost is -9.0 at state = 1, ac"):
+        lm.compile(problem.replaced(stage_cost="-10*state"))
+    with pytest.raises(lm.BadInput, match=r"terminal cost is -0\.5 at state = 2"):
         lm.compile(problem.replaced(terminal_cost="-0.5"))  # whatever else is paid
     other = problem.replaced(admissible="state > 0 or action == 1")
     assert lm.solve(other).value.tolist() == pytest.approx([5, 1, 0])

@@ -68,8 +68,12 @@ class Entries:
         return Endings(np.ascontiguousarray(index), place, np.empty(0), np.empty(0))
 
     def costs(self, ends: Endings, guard: Guard) -> dict[str, Floats]:
-        """Return by key what samples pay besides a stage cost, in their shape."""
-        costs, shape = {}, ends.cell.shape
+        """Return by key what samples pay besides a stage cost, in their shape.
+
+        Of the terminal cost it is the formula's value, by which ``factor`` is to be multiplied.
+        """
+        costs: dict[str, Floats] = {}
+        shape = ends.cell.shape
         if len(ends.integral):
             costs["cost_rate"] = ends.integral.reshape(shape)
         if self.terminal is not None:
@@ -80,6 +84,6 @@ class Entries:
             states = self.partition.states(ends.place[:, absorbed].T)
             named = dict(zip(self.partition.names, states.T, strict=True))
             paid = np.zeros(index.shape)
-            paid[absorbed] = self.factor * self.terminal(named, guard)[0]
+            paid[absorbed] = self.terminal(named, guard)[0]
             costs["terminal_cost"] = paid.reshape(shape)
         return costs

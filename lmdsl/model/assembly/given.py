@@ -1,5 +1,7 @@
 """The rows of a finite model, given and not sampled, as transitions on the free cells."""
 
+from collections.abc import Callable, Mapping
+
 import numpy as np
 
 from lmdsl.common.types import Bools, Floats, Indices
@@ -90,29 +92,47 @@ def _cost(
     if terminal is not None:
         centres = partition.centres(given.target[entered].astype(np.int64))
         states = dict(zip(problem.states, centres.T, strict=True))
-        (end,) = Program([terminal], problem.system.constants())(states)
-        paid += np.where(end < 0, np.nan, end)  # no other cost may hide it
+        (value,) = Program([terminal], problem.system.constants())(states)
+        end = np.broadcast_to(value, paid.shape)
+        used = np.where(np.isin(given.owner()[entered], kept), end, 0.0)
+        _refuse_cost("terminal_cost", used, lambda e: _said(states, e))
+        paid += end
     if paid.any():
         paid *= problem.gamma * (1.0 if problem.discount is None else problem.discount)
         paid *= given.values()[given.code[entered]]
         cost = cost + np.bincount(given.owner()[entered], paid, given.pairs)[kept]
     if not system.pays_all and str(problem.stage_cost).strip() != "0":
         cost = cost + _at_pairs(problem, partition, given, problem.cost())[kept]
-    if not (np.isfinite(cost) & (cost >= 0)).all():
-        k = kept[np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))[0]]
-        raise BadInput(
-            f"the cost of cell {given.cell[k]} under control {given.control[k]} is not finite and "
-            ">= 0",
-            "stage_cost",
-        )
+    _refuse_cost("stage_cost", cost, lambda k: _said(_pairs(problem, partition, given), kept[k]))
     return cost
+
+
+def _refuse_cost(key: str, cost: Floats, place: Callable[[int], str]) -> None:
+    """Refuse costs that are negative or not finite, and say where."""
+    wrong = np.flatnonzero(~(np.isfinite(cost) & (cost >= 0)))
+    if len(wrong):
+        k = int(wrong[0])
+        raise BadInput(
+            f"the {key.replace('_', ' ')} is {float(cost[k])!r} at {place(k)}; it must be finite "
+            "and >= 0",
+            key,
+        )
+
+
+def _said(values: Mapping[str, Floats], k: int) -> str:
+    return ", ".join(f"{name} = {array[k] + 0.0:.6g}" for name, array in values.items())
 
 
 def _at_pairs(problem: Problem, partition: Partition, given: GivenRows, formula: Formula) -> Floats:
     """Return a formula in state and control at every pair."""
+    values = _pairs(problem, partition, given)
+    (found,) = Program([formula], problem.system.constants())(values)
+    return np.asarray(np.broadcast_to(found, given.pairs), dtype=np.float64)
+
+
+def _pairs(problem: Problem, partition: Partition, given: GivenRows) -> dict[str, Floats]:
+    """Return the states and controls of every pair, by name."""
     centres = partition.centres(given.cell.astype(np.int64))
     controls = discretization.control_vectors(problem)[given.control]
     values = dict(zip(problem.states, centres.T, strict=True))
-    values |= dict(zip(problem.controls, controls.T, strict=True))
-    (found,) = Program([formula], problem.system.constants())(values)
-    return np.asarray(np.broadcast_to(found, given.pairs), dtype=np.float64)
+    return values | dict(zip(problem.controls, controls.T, strict=True))

@@ -163,7 +163,7 @@ class Sampler:
         values, shape = self.values(block), self._shape(block)
         if self._entries is not None:
             ends = self._entries.ends(values, self._step, shape, self.guard)
-            cost = self._mean(_together(self._by_key(values, ends)))
+            cost = self._mean(self._paid(self._by_key(values, ends)))
             return self._samples_together(self._admitted_only(values, ends.cell)), cost
         index = mean = None
         axes, clip, weights = self.partition.axes, self.partition.clip, self.nodes.weights
@@ -215,10 +215,13 @@ class Sampler:
 
         The shape is (first, last), with 1 for an axis on which the cost does not depend.
         """
-        return self._mean(_together(self.costs_by_key(block, values)))
+        return self._mean(self._paid(self.costs_by_key(block, values)))
 
     def costs_by_key(self, block: Block, values: Mapping[str, Floats]) -> dict[str, Floats]:
-        """Return what samples cost, by key of the problem, in shapes that broadcast to theirs."""
+        """Return what samples cost, by key of the problem, in shapes that broadcast to theirs.
+
+        Each is the value of its formula: a terminal cost is paid times gamma and the discount.
+        """
         if self._entries is None:
             return self._by_key(values, None)
         ends = self._entries.ends(values, self._step, self._shape(block), self.guard)
@@ -232,6 +235,16 @@ class Sampler:
         if self._entries is not None and ends is not None:
             costs |= self._entries.costs(ends, self.guard)
         return costs
+
+    def _paid(self, costs: dict[str, Floats]) -> Floats:
+        """Return what samples pay in all, NaN where a part is negative: another may not hide it."""
+        if self._entries is not None and "terminal_cost" in costs:
+            costs = {**costs, "terminal_cost": self._entries.factor * costs["terminal_cost"]}
+        total: Floats = sum(costs.values(), np.zeros(()))
+        if len(costs) > 1:
+            for part in costs.values():
+                total = np.where(part < 0, np.nan, total)
+        return total
 
     def _step(self, values: Mapping[str, Floats]) -> tuple[Floats, ...]:
         """Return the images; of a user's function some are asked for again."""
@@ -253,15 +266,6 @@ class Sampler:
         mean = np.zeros((cost.shape[0], cost.shape[3]))
         mean_cost(fixed(cost), len(self.points), self.nodes.weights, mean, mean.copy())
         return mean
-
-
-def _together(costs: Mapping[str, Floats]) -> Floats:
-    """Return what samples pay in all, NaN where a part is negative: another may not hide it."""
-    total: Floats = sum(costs.values(), np.zeros(()))
-    if len(costs) > 1:
-        for part in costs.values():
-            total = np.where(part < 0, np.nan, total)
-    return total
 
 
 def chunk(problem: Problem) -> int:

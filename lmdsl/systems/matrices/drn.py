@@ -39,6 +39,7 @@ class Explicit:
     target: list[int] = field(default_factory=list)
     share: list[Fraction] = field(default_factory=list)
     decimal: bool = False
+    told: dict[str, tuple[int, str]] = field(default_factory=dict)  # lines of the header
 
 
 def read_drn(path: str | os.PathLike[str], reward: str | None) -> tuple[Listing, Explicit]:
@@ -69,6 +70,7 @@ def read_drn(path: str | os.PathLike[str], reward: str | None) -> tuple[Listing,
         share=fill(len(found.share), lambda x: x, found.share),
         of_pair=doubles(fill(len(found.cost), lambda x: x, found.cost), "cost"),
         decimal=found.decimal,
+        labels=found.labels,
     ), found
 
 
@@ -92,7 +94,7 @@ def _read(lines: Numbered, reward: str | None) -> Explicit:
             found.rewards = next(lines, (0, ""))[1].split()
         elif words[0] in ("@nr_states", "@nr_choices", "@value_type:"):
             if words[0][-1] != ":":
-                next(lines, None)
+                found.told[words[0]] = next(lines, (number, ""))
         elif words[0] == "@model":
             break
         else:
@@ -100,7 +102,20 @@ def _read(lines: Numbered, reward: str | None) -> Explicit:
     if not kind:
         raise BadInput("the file does not begin as DRN: it names no @type", "P")
     _read_states(lines, found, _place(found.rewards, reward))
+    _require_told(found)
     return found
+
+
+def _require_told(found: Explicit) -> None:
+    """Refuse a file whose header counts something else than there is."""
+    for header, count, of in (
+        ("@nr_states", found.states, "states"),
+        ("@nr_choices", len(found.state), "choices"),
+    ):
+        number, told = found.told.get(header, (0, str(count)))
+        if told.strip() != str(count):
+            says = f"{header} says {shown(told.strip())}, but the file has {count} {of}"
+            raise _fault(number, says)
 
 
 def _place(models: list[str], wanted: str | None) -> int | None:

@@ -1,14 +1,14 @@
 """What every layout of matrices is read into: pairs, and the transitions of each."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Indices
-from lmdsl.errors import BadInput
+from lmdsl.errors import BadInput, printable
 
 MOST = 2**31 - 2
 """States, actions and pairs at most."""
@@ -29,6 +29,7 @@ class Listing:
     of_pair: Floats | None = None  # cost or reward of each pair
     ends: Bools | None = None  # transitions that end the run
     decimal: bool = False  # the fractions were written as decimals, which may be rounded
+    labels: Mapping[str, Sequence[int]] = field(default_factory=dict)  # states by label
 
     def ordered(self) -> Self:
         """Return the same by state, then action; transitions by target, those of share 0 dropped.
@@ -66,7 +67,10 @@ class Listing:
 
     def name(self, k: int) -> str:
         """Return how messages name a pair."""
-        return f"state {int(self.state[k])}, action {int(self.action[k])}"
+        state = int(self.state[k])
+        labels = [label for label, states in self.labels.items() if state in states]
+        told = f" ({printable(', '.join(labels[:4]))[:80]})" if labels else ""
+        return f"state {state}{told}, action {int(self.action[k])}"
 
     def _in_range(self) -> None:
         for what, index, count in (
