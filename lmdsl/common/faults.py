@@ -53,8 +53,13 @@ class _Fault(NamedTuple):
     """The keys that are known there, to be said once."""
 
 
-def condensed(error: ValidationError, model: Any) -> BadInput:
-    """Return all faults of pydantic's report on a model as one error; misspelt keys come first."""
+def condensed(
+    error: ValidationError, model: Any, more: Callable[[], Iterable[BadInput]] = tuple
+) -> BadInput:
+    """Return all faults of pydantic's report on a model as one error; misspelt keys come first.
+
+    ``more`` finds others where the model itself was not asked: the type of a part was refused.
+    """
     items = error.errors(include_url=False)
     faults = [_fault(item, model) for item in items if not _follows(item)]
     meant = {fault.meant for fault in faults if fault.meant}
@@ -65,6 +70,8 @@ def condensed(error: ValidationError, model: Any) -> BadInput:
     for fault in faults:
         found.append(BadInput(fault.message + fault.known * (fault.known not in said), fault.where))
         said.add(fault.known)
+    if all(item["loc"] for item in items):
+        found += more()
     return together(found)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self, TypeVar
 
 import numpy as np
@@ -115,7 +116,8 @@ class _Meta(ModelMetaclass):
         try:
             return super().__call__(**kwargs)
         except ValidationError as error:
-            raise condensed(error, cls) from None
+            model: Any = cls
+            raise condensed(error, model, partial(model._also_wrong, kwargs)) from None
 
 
 class Declared(BaseModel, metaclass=_Meta):
@@ -167,7 +169,12 @@ class Declared(BaseModel, metaclass=_Meta):
         try:
             return super().model_validate(obj, **kwargs)
         except ValidationError as error:
-            raise condensed(error, cls) from None
+            raise condensed(error, cls, partial(cls._also_wrong, obj)) from None
+
+    @classmethod
+    def _also_wrong(cls, data: Any) -> list[BadInput]:
+        """Return what else is wrong with data that the types of some keys refuse."""
+        return []
 
     @classmethod
     def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:

@@ -89,6 +89,8 @@ class Definition(NamedTuple):
 # Named subexpressions in order: each uses earlier ones only.
 Definitions = Mapping[str, Definition]
 
+_ANY: Final = Definition((Subformula("constant"),), None, frozenset(), frozenset())
+
 NO_DEFINITIONS: Final[Definitions] = MappingProxyType({})
 
 
@@ -144,7 +146,11 @@ def negation(condition: Formula) -> Formula:
     return Formula(f"not ({condition.text})", condition.names, (*condition.subformulas, last))
 
 
-def define(texts: Mapping[str, str], names: Collection[str]) -> Definitions:
+def define(
+    texts: Mapping[str, str],
+    names: Collection[str],
+    faults: list[tuple[str, FormulaError]] | None = None,
+) -> Definitions:
     """Check named subexpressions.
 
     Parameters
@@ -153,6 +159,8 @@ def define(texts: Mapping[str, str], names: Collection[str]) -> Definitions:
         A formula for each name, in order; it may use earlier names.
     names
         The declared names.
+    faults
+        Takes what is refused, by name, instead of raising it; then it has any value.
 
     Raises
     ------
@@ -164,7 +172,11 @@ def define(texts: Mapping[str, str], names: Collection[str]) -> Definitions:
         try:
             parser = Parser(text, names, found, later=texts.keys() - found.keys())
         except FormulaError as error:
-            raise FormulaError(error.message, error.position, name) from None
+            if faults is None:
+                raise FormulaError(error.message, error.position, name) from None
+            faults.append((name, error))
+            found[name] = _ANY
+            continue
         used = {part.name for part in parser.subformulas if part.name}
         earlier = [found[other] for other in used if other in found]
         found[name] = Definition(

@@ -69,8 +69,8 @@ class FormulaError(BadInput):
 class UndeclaredName(FormulaError):
     """A formula with a name that has no value in it; ``name`` is that name."""
 
-    def __init__(self, message: str, position: int, name: str) -> None:
-        super().__init__(message, position)
+    def __init__(self, message: str, position: int, name: str, where: str = "") -> None:
+        super().__init__(message, position, where)
         self.name = name
 
 

@@ -15,13 +15,12 @@ from lmdsl.common import inputs
 from lmdsl.common.files import read_json, write_whole
 from lmdsl.common.strict_model import Declared, FileSchema, Fractional, Positive
 from lmdsl.errors import BadInput, shown
-from lmdsl.formulas.language import Formula, defined, parse, parse_condition
+from lmdsl.formulas.language import Formula, defined
 from lmdsl.formulas.names import FormulaText, Let
 from lmdsl.formulas.program import Program
-from lmdsl.formulas.tokens import UndeclaredName, elsewhere
-from lmdsl.problem import endings
 from lmdsl.problem.axes import StateBox
-from lmdsl.problem.consistency import require_consistent, require_writable
+from lmdsl.problem.consistency import endings, texts
+from lmdsl.problem.consistency.keys import PLACES, require_consistent, require_writable
 from lmdsl.problem.controls import ControlGrid
 from lmdsl.problem.local_control import LocalUnion
 from lmdsl.problem.noise import Noise
@@ -75,17 +74,7 @@ class Problem(Declared):
         With the path of the field, the value and the fix.
     """
 
-    elsewhere: ClassVar[Mapping[str, str]] = {
-        key: f"it is a key of {where}; move it there"
-        for where, keys in {
-            "system": ("step", "substeps", "judged", "next", "derivative", "parameters"),
-            "sampling": ("per_axis", "corners", "seed"),
-            "an axis of state_box": ("periodic", "cells"),
-            "attractor, avoid or measure": ("where", "boxes"),
-            "measure": ("density",),
-        }.items()
-        for key in keys
-    }
+    elsewhere: ClassVar[Mapping[str, str]] = PLACES
     format: Literal["lmdsl/1"] = "lmdsl/1"
     name: Annotated[str, Field(max_length=1000)] = ""
     system: SystemUnion
@@ -155,7 +144,7 @@ class Problem(Declared):
 
     @property
     def ends_in_time(self) -> bool:
-        """Whether gamma times the discount is below 1: then no run costs more than a finite sum."""
+        """Whether gamma times the discount is below 1, so that all costs are finite."""
         return self.discount is not None and endings.rate(self) < 1
 
     def step(self) -> StateMap:
@@ -164,11 +153,7 @@ class Problem(Declared):
         return system.compile(self.names())
 
     def formula(
-        self,
-        text: str,
-        where: str,
-        kinds: Collection[str] = ("state", "control", "noise"),
-        condition: bool = False,
+        self, text: str, where: str, kinds: Collection[str] = texts.ALL, condition: bool = False
     ) -> Formula:
         """Return a formula or condition of this problem, parsed.
 
@@ -189,18 +174,15 @@ class Problem(Declared):
         BadInput
             It is no formula of these names.
         """
-        names = {*self.system.constants()}
-        known = {"state": self.states, "control": self.controls, "noise": self.noises}
-        for kind in kinds:
-            names.update(known[kind])
+        named = {"state": self.states, "control": self.controls, "noise": self.noises}
         definitions = self.names().definitions  # whose faults are not of this field
-        try:
-            return (parse_condition if condition else parse)(text, names, definitions)
-        except UndeclaredName as error:
-            usable = {*names, *(d for d in definitions if definitions[d].names <= names)}
-            raise BadInput(elsewhere(error, known, kinds, usable), where) from None
-        except BadInput as error:
-            raise BadInput(error.message, where) from None
+        known = texts.Declarations(named, self.system.constants(), definitions)
+        return texts.parsed(texts.Text(where, text, kinds, condition), known)
+
+    @classmethod
+    def _also_wrong(cls, data: Any) -> list[BadInput]:
+        """Return what is wrong with the formulas."""
+        return texts.faults(data, cls.model_fields)
 
     def names(self) -> Names:
         """Return what the system may name, with what ``let`` defines by it, parsed."""
@@ -247,29 +229,29 @@ class Problem(Declared):
         """Return the parsed terminal cost, None where there is none."""
         if self.terminal_cost is None:
             return None
-        return self.formula(self.terminal_cost, "terminal_cost", ("state",))
+        return self.formula(self.terminal_cost, "terminal_cost", texts.STATES)
 
     def density(self) -> Formula | None:
         """Return the parsed density of the weight m, None where there is none."""
         if self.measure is None or self.measure.density is None:
             return None
-        return self.formula(self.measure.density, "measure.density", ("state",))
+        return self.formula(self.measure.density, "measure.density", texts.STATES)
 
     def admitted(self) -> Formula | None:
         """Return the condition of admissible pairs, None where there is none."""
         if self.admissible is None:
             return None
-        return self.formula(self.admissible, "admissible", ("state", "control"), condition=True)
+        return self.formula(self.admissible, "admissible", texts.PAIRS, condition=True)
 
     def conditions(self, where: str) -> tuple[Formula, ...]:
         """Return the conditions of ``attractor``, ``avoid`` or ``measure``."""
         part = getattr(self, where)
-        texts = () if part is None or part.where is None else part.where
-        if isinstance(texts, str):
-            return (self.formula(texts, f"{where}.where", ("state",), condition=True),)
+        written = () if part is None or part.where is None else part.where
+        if isinstance(written, str):
+            return (self.formula(written, f"{where}.where", texts.STATES, condition=True),)
         return tuple(
-            self.formula(text, f"{where}.where[{i}]", ("state",), condition=True)
-            for i, text in enumerate(texts)
+            self.formula(text, f"{where}.where[{i}]", texts.STATES, condition=True)
+            for i, text in enumerate(written)
         )
 
     def replaced(self, **changes: Any) -> Self:

@@ -57,8 +57,9 @@ BAD = [
     ("periodic number", changed("state_box", "x", "periodic", value=1), "periodic", "1"),
     ("no axis", changed("state_box", value={}), "state_box", ""),
     ("box list", changed("state_box", value=[]), "state_box", ""),
-    ("17 axes", changed("state_box", value={f"x{i}": {"low": 0, "high": 1, "cells": 1}
-                                            for i in range(17)}), "state_box", "16"),
+    ("17 axes", changed("state_box", value={f"x{i or ''}": {"low": 0, "high": 1, "cells": 1}
+                                            for i in range(17)}, base={**steps(), "system": {
+        "kind": "map", "next": {f"x{i or ''}": "u" for i in range(17)}}}), "state_box", "16"),
     ("bad axis name", changed("state_box", value={"x y": {"low": 0, "high": 1, "cells": 1}}),
      "state_box", "x y"),
     ("keyword axis", changed("state_box", value={"lambda": {"low": 0, "high": 1, "cells": 1}}),

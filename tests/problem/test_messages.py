@@ -118,3 +118,87 @@ def test_kinds_that_no_file_holds_are_not_offered():
     assert "did you mean 'ode'?" in text
     assert "function" not in text
     assert "matrices" not in text
+
+
+# Types, unknown keys and formulas together ---------------------------------------------------
+
+
+def test_formulas_are_judged_beside_types_and_unknown_keys():
+    text = said(
+        gamma=-1,
+        system={"kind": "map", "next": {"x": "x^2"}},
+        let={"a": "1 +", "b": "nobody"},
+        stage_cost="a + x y",
+        terminal_cost="u",
+        admissible="x",
+        attractor={"cells": [[0]], "where": ["x < 1", "w < 1"]},
+        avoid={"where": "x = 1"},
+        measure={"density": "2x", "where": "x"},
+        noise={"w": {"values": [0], "weights": [2]}},
+    )
+    for place in (
+        "gamma: -1 is not accepted", "noise.w.weights[0]: 2.0 is more than 1",
+        "system.next.x: character 2: '^'", "let.a: character 4", "let.b: character 1: 'nobody'",
+        "stage_cost: character 7: an operator is missing", "terminal_cost: character 1: 'u' is a c",
+        "admissible: character 1: 'x' is not a comparison",
+        "attractor.where[1]: character 1: 'w' is a noise variable",
+        "avoid.where: character 3: '='", "measure.density: character 1: '2x'",
+        "measure.where: character 1: 'x' is not a comparison",
+    ):  # fmt: skip
+        assert place in text, place
+    assert text.count("; and ") == 0
+
+
+@pytest.mark.parametrize(
+    ("change", "count"),
+    [
+        # What the names are is not known: nothing is said of names, but of everything else.
+        ({"statebox": {"x": {"low": 0, "high": 1, "cells": 4}}, "state_box": None}, 0),
+        ({"controls": {"v": {"values": [0]}}}, 0),
+        ({"noise": 3}, 0),
+        ({"system": {"kind": "maps", "next": {"x": "x + v"}}}, 0),
+        ({"system": {"kind": "map", "params": {"v": 1}, "next": {"x": "x + v"}}}, 0),
+        ({"system": {"kind": "map", "parameters": [1], "next": {"x": "x + v"}}}, 0),
+        ({"let": {"v": 1}}, 0),
+        ({"control_grid": {"u v": {"values": [0]}}}, 0),
+        # They are known: v is none of them.
+        ({"gamma": "1"}, 1),
+        ({"gamma": "1", "control_grid": {"v": {"values": [0, True]}}, "stage_cost": "u"}, 2),
+    ],
+)
+def test_names_are_judged_where_they_are_known(change, count):
+    data = {**steps(), "stage_cost": "v", **change}
+    data = {key: value for key, value in data.items() if value is not None}
+    with pytest.raises(lm.BadInput) as caught:
+        made(data)
+    assert str(caught.value).count("is not a declared name") == count, str(caught.value)
+    if count:
+        return
+    data["stage_cost"] = "v*v2 + v^2"
+    with pytest.raises(lm.BadInput, match=r"stage_cost: character 9: '\^' is not part"):
+        made(data)
+    data["stage_cost"] = "v + arcsin(v)"
+    with pytest.raises(lm.BadInput, match=r"stage_cost: character 5: 'arcsin' .* mean 'asin'\?"):
+        made(data)
+
+
+def test_faults_of_let_hide_no_others_and_are_said_once():
+    text = said(let={"a": "x y", "b": "a + (", "c": "a + b"}, stage_cost="c + z", admissible="c")
+    assert text.count("let.a: ") == text.count("let.b: ") == 1
+    assert "stage_cost: character 5: 'z'" in text
+    assert "admissible: character 1: 'c' is not a comparison" in text
+    assert "let.c" not in text
+
+
+def test_formulas_of_a_problem_in_python_are_judged_too():
+    problem = made(steps())
+    with pytest.raises(lm.BadInput) as caught:
+        problem.replaced(gamma=-1, stage_cost="nobody", system=lm.systems.StandardMap())
+    text = str(caught.value)
+    assert "gamma: -1" in text
+    assert "stage_cost: character 1: 'nobody' is not a declared name" in text
+
+
+def test_a_file_of_many_wrong_formulas_takes_no_time():
+    text = said(gamma=-1, attractor={"where": ["x <"] * 100_000}, let={"a": "x +" * 1_000})
+    assert len(text) < 10_000

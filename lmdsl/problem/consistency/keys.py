@@ -7,13 +7,26 @@ from typing import TYPE_CHECKING, Any
 from lmdsl.common import spelling
 from lmdsl.common.faults import require_all, written
 from lmdsl.errors import BadInput, shown
-from lmdsl.problem import endings
+from lmdsl.problem.consistency import endings, texts
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
-from lmdsl.systems import MatrixSystem, OdeSystem
+from lmdsl.systems import MapSystem, MatrixSystem, OdeSystem
 from lmdsl.systems.named import NamedOde
 
 if TYPE_CHECKING:
     from lmdsl.problem.problem import Problem
+
+
+PLACES = {
+    key: f"it is a key of {where}; move it there"
+    for where, keys in {
+        "system": ("step", "substeps", "judged", "next", "derivative", "parameters"),
+        "sampling": ("per_axis", "corners", "seed"),
+        "an axis of state_box": ("periodic", "cells"),
+        "attractor, avoid or measure": ("where", "boxes"),
+        "measure": ("density",),
+    }.items()
+    for key in keys
+}
 
 
 def require_writable(problem: "Problem") -> None:
@@ -40,13 +53,17 @@ def require_consistent(problem: "Problem") -> None:
 
 
 def _formulas(problem: "Problem") -> Iterator[Callable[[], object]]:
-    """Yield what parses the formulas of a problem, those of ``let`` first."""
-    yield problem.names
-    yield problem.step
-    if problem.stage_cost is not None or problem.cost_rate is not None:
-        yield lambda: problem.stage() or problem.cost()
-    yield from (problem.terminal, problem.density, problem.admitted)
-    yield from (partial(problem.conditions, key) for key in ("attractor", "avoid", "measure"))
+    """Yield what finds the faults of formulas, and of functions that stand for some."""
+    for fault in texts.faults(problem):
+        yield partial(_refuse, fault)
+    if not isinstance(problem.system, MapSystem | OdeSystem):
+        yield problem.step
+    if callable(problem.stage_cost):
+        yield problem.stage
+
+
+def _refuse(fault: BadInput) -> None:
+    raise fault
 
 
 def _unique_names(problem: "Problem") -> None:
