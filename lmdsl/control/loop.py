@@ -13,7 +13,6 @@ from lmdsl.control.controller import Controller
 from lmdsl.control.integration import Integrator
 from lmdsl.control.steps import CompiledSteps, Drawn, Moved, Steps
 from lmdsl.errors import BadInput
-from lmdsl.formulas.program import Program
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.surroundings import own_arithmetic
@@ -104,10 +103,7 @@ class ClosedLoop:
         self.noise = Drawn(problem, as_compiled)
         self.weight = problem.gamma * (problem.discount or 1.0)
         paid = isinstance(system, MatrixSystem) and system.pays_all
-        self._stage, terminal = None if paid else problem.stage(), problem.terminal()
-        self._terminal: Program | None = None
-        if terminal is not None:
-            self._terminal = Program([terminal], problem.system.constants())
+        self._stage, self._terminal = None if paid else problem.stage(), problem.terminal()
 
     @cached_property
     def compiled(self) -> "ClosedLoop":

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput
-from lmdsl.formulas.program import Program
 from lmdsl.model import discretization
 from lmdsl.model.grid.partition import Partition
 from lmdsl.problem.problem import Problem
@@ -108,7 +107,7 @@ def _costs(problem: Problem, given: Recording, kept: Indices, control: Indices) 
     values = dict(zip(problem.states, given.x[kept].T, strict=True))
     values |= dict(zip(problem.controls, vectors.T, strict=True))
     with np.errstate(all="ignore"):
-        (cost,) = Program([problem.cost()], problem.system.constants())(values)
+        (cost,) = problem.program(problem.cost())(values)
     found = np.array(np.broadcast_to(cost, len(kept)), dtype=np.float64)
     wrong = np.flatnonzero(~(np.isfinite(found) & (found >= 0)))
     if len(wrong):

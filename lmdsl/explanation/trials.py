@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Indices
-from lmdsl.formulas.program import Program
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model import discretization
 from lmdsl.model.assembly.sampler import CHUNK
@@ -78,10 +77,7 @@ class MapTrial:
         self.controls = some(discretization.control_vectors(problem), most.controls)
         each = len(self.points) * len(self.nodes) * len(self.controls)
         self.most_cells = max(1, min(most.cells, CHUNK // each))
-        condition = problem.admitted()
-        self._admitted: Program | None = None
-        if condition is not None:
-            self._admitted = Program([condition], problem.system.constants())
+        self._admitted = problem.admitted()
         self.span: Floats = self.partition.high - self.partition.low
 
     def shape(self, cells: Indices) -> tuple[int, ...]:

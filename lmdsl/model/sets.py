@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from lmdsl.common.faults import together
 from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.errors import BadInput
-from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid import boxes, conditions
@@ -112,11 +111,10 @@ def _mass(problem: Problem, partition: Partition, guard: Guard) -> Floats:
             )
         mass = np.array(declared.weights)
     elif density is not None:
-        program = Program([density], problem.system.constants())
         for start in range(0, partition.size, PART):
             some = np.arange(start, min(start + PART, partition.size))
             centres = partition.centres(some)
-            mass[some] = program(dict(zip(partition.names, centres.T, strict=True)), guard)[0]
+            mass[some] = density(dict(zip(partition.names, centres.T, strict=True)), guard)[0]
         bad = np.flatnonzero(~((mass >= 0) & np.isfinite(mass)))
         if len(bad):
             cell = boxes.named(partition, int(bad[0]))

@@ -27,7 +27,7 @@ from lmdsl.problem.noise import Noise
 from lmdsl.problem.sampling import SamplingUnion
 from lmdsl.problem.sets import REACHED_OR_ENDED, Attractor, Avoid, Measure
 from lmdsl.problem.unions import SystemUnion
-from lmdsl.systems import FunctionSystem, System
+from lmdsl.systems import FunctionSystem
 from lmdsl.systems.base import Judged, Names, StateMap
 from lmdsl.systems.black_box.cost import StageCost, cost_map
 from lmdsl.systems.runge_kutta import RungeKutta
@@ -149,8 +149,7 @@ class Problem(Declared):
 
     def step(self) -> StateMap:
         """Return the map of the system, from named arrays to images."""
-        system: System = self.system
-        return system.compile(self.names())
+        return self.system.compile(self.names())
 
     def formula(
         self, text: str, where: str, kinds: Collection[str] = texts.ALL, condition: bool = False
@@ -193,6 +192,10 @@ class Problem(Declared):
         except BadInput as error:
             raise BadInput(error.message, f"let.{error.where}") from None
 
+    def program(self, *formulas: Formula) -> Program:
+        """Return the function from named arrays to the values of formulas of this problem."""
+        return Program(formulas, self.system.constants())
+
     @property
     def judged(self) -> Judged:
         """Whether ``path`` or ``endpoint`` of a step is judged; a map has no path."""
@@ -201,9 +204,8 @@ class Problem(Declared):
 
     def flow(self, cost: bool = True) -> RungeKutta | None:
         """Return how the equation, and with it the cost rate, is integrated; None for a map."""
-        system: System = self.system
         rate = self.cost() if cost and self.cost_rate is not None else None
-        return system.flow(self.names(), rate)
+        return self.system.flow(self.names(), rate)
 
     @property
     def functions(self) -> tuple[str, ...]:
@@ -223,25 +225,23 @@ class Problem(Declared):
         """Return the stage cost of named arrays; None where a cost rate stands for it."""
         if callable(self.stage_cost):
             return cost_map(self.stage_cost, self)
-        return None if self.cost_rate else Program([self.cost()], self.system.constants())
+        return None if self.cost_rate else self.program(self.cost())
 
-    def terminal(self) -> Formula | None:
-        """Return the parsed terminal cost, None where there is none."""
-        if self.terminal_cost is None:
-            return None
-        return self.formula(self.terminal_cost, "terminal_cost", texts.STATES)
+    def terminal(self) -> Program | None:
+        """Return the terminal cost of named arrays, None where there is none."""
+        return self._given(self.terminal_cost, "terminal_cost", texts.STATES)
 
-    def density(self) -> Formula | None:
-        """Return the parsed density of the weight m, None where there is none."""
-        if self.measure is None or self.measure.density is None:
-            return None
-        return self.formula(self.measure.density, "measure.density", texts.STATES)
+    def density(self) -> Program | None:
+        """Return the density of the weight m of named arrays, None where there is none."""
+        text = None if self.measure is None else self.measure.density
+        return self._given(text, "measure.density", texts.STATES)
 
-    def admitted(self) -> Formula | None:
-        """Return the condition of admissible pairs, None where there is none."""
-        if self.admissible is None:
-            return None
-        return self.formula(self.admissible, "admissible", texts.PAIRS, condition=True)
+    def admitted(self) -> Program | None:
+        """Return the condition of admissible pairs on named arrays, None where there is none."""
+        return self._given(self.admissible, "admissible", texts.PAIRS, True)
+
+    def _given(self, text: str | None, *how: Any) -> Program | None:
+        return None if text is None else self.program(self.formula(text, *how))
 
     def conditions(self, where: str) -> tuple[Formula, ...]:
         """Return the conditions of ``attractor``, ``avoid`` or ``measure``."""

@@ -10,7 +10,6 @@ from typing import Self
 import numpy as np
 
 from lmdsl.common.types import Floats, Guard
-from lmdsl.formulas.program import Program
 from lmdsl.model.assembly.paths.judging import Endings, PathJudge, path_doubles
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
@@ -36,12 +35,9 @@ class Entries:
 
     def __init__(self, problem: Problem, partition: Partition, sets: CellSets) -> None:
         self.partition, self.sets = partition, sets
-        flow, terminal = integrated(problem), problem.terminal()
+        flow, self.terminal = integrated(problem), problem.terminal()
         endpoint = problem.judged == "endpoint"
         self.path = None if flow is None else PathJudge(flow, partition, sets, endpoint)
-        self.terminal: Program | None = None
-        if terminal is not None:
-            self.terminal = Program([terminal], problem.system.constants())
         self.factor = problem.gamma * (1.0 if problem.discount is None else problem.discount)
 
     @classmethod

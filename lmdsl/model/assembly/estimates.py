@@ -3,7 +3,6 @@
 import math
 from typing import NamedTuple
 
-from lmdsl.formulas.program import Program
 from lmdsl.machine import memory, threads
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model import discretization
@@ -65,11 +64,7 @@ def _blocks(problem: Problem, S: int) -> int:
     step, cost = problem.step(), problem.stage()
     d, samples, count = len(problem.state_box), max(chunk(problem), S), threads.count()
     # States, images and their cells, paths, the arrays of a formula, keys and rows.
-    condition = problem.admitted()
-    others = [cost] if cost else []
-    if condition is not None:
-        others.append(Program([condition], problem.system.constants()))
-    live = max(step.live, *(other.live for other in others)) if others else step.live
+    live = max(each.live for each in (step, cost, problem.admitted()) if each is not None)
     each = 8 * samples * (3 * d + live + 8)
     if doubles(problem):
         each += 8 * max(KEPT, doubles(problem))
@@ -106,24 +101,24 @@ def work(problem: Problem) -> float:
     samples = discretization.sample_points(problem) * discretization.node_count(problem)
     step, cost = problem.step(), problem.stage()
     if cost is None:  # a rate, of the same names
-        cost = Program([problem.cost()], problem.system.constants())
+        cost = problem.program(problem.cost())
     calls = 2 + 2 * lanes * min(samples, CHUNK) // CHUNK
     locating = SAMPLE * (1 + doubles(problem) // 8)
     work = lanes * samples * (locating + step.work + cost.work)
     condition = problem.admitted()
     if condition is not None:
-        work += lanes * samples * Program([condition], problem.system.constants()).work
+        work += lanes * samples * condition.work
     work += CALL * calls * (step.effort + cost.effort)
     attractor, avoid, weight = problem.attractor, problem.avoid, problem.measure
     boxes = [attractor.boxes, (avoid and avoid.boxes) or (), (weight and weight.boxes) or ()]
     count = sum(map(len, boxes))
     work += N * count + SET * (count + len(attractor.points) + len(attractor.cells))
     for where in ("attractor", "avoid", "measure"):
-        for condition in problem.conditions(where):
-            work += ENCLOSED * N * Program([condition], problem.system.constants()).work
+        for each in problem.conditions(where):
+            work += ENCLOSED * N * problem.program(each).work
     density = problem.density()
     if density is not None:
-        work += N * Program([density], problem.system.constants()).work
+        work += N * density.work
     if problem.local_controller is not None:  # linearised: some fifty operations for each
         work += 50 * CALL * step.effort
     return work

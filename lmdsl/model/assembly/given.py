@@ -6,7 +6,6 @@ import numpy as np
 
 from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput
-from lmdsl.formulas.language import Formula
 from lmdsl.formulas.program import Program
 from lmdsl.machine import memory
 from lmdsl.model import discretization
@@ -92,7 +91,7 @@ def _cost(
     if terminal is not None:
         centres = partition.centres(given.target[entered].astype(np.int64))
         states = dict(zip(problem.states, centres.T, strict=True))
-        (value,) = Program([terminal], problem.system.constants())(states)
+        (value,) = terminal(states)
         end = np.broadcast_to(value, paid.shape)
         used = np.where(np.isin(given.owner()[entered], kept), end, 0.0)
         _refuse_cost("terminal_cost", used, lambda e: _said(states, e))
@@ -102,7 +101,7 @@ def _cost(
         paid *= given.values()[given.code[entered]]
         cost = cost + np.bincount(given.owner()[entered], paid, given.pairs)[kept]
     if not system.pays_all and str(problem.stage_cost).strip() != "0":
-        cost = cost + _at_pairs(problem, partition, given, problem.cost())[kept]
+        cost = cost + _at_pairs(problem, partition, given, problem.program(problem.cost()))[kept]
     _refuse_cost("stage_cost", cost, lambda k: _said(_pairs(problem, partition, given), kept[k]))
     return cost
 
@@ -123,10 +122,9 @@ def _said(values: Mapping[str, Floats], k: int) -> str:
     return ", ".join(f"{name} = {array[k] + 0.0:.6g}" for name, array in values.items())
 
 
-def _at_pairs(problem: Problem, partition: Partition, given: GivenRows, formula: Formula) -> Floats:
-    """Return a formula in state and control at every pair."""
-    values = _pairs(problem, partition, given)
-    (found,) = Program([formula], problem.system.constants())(values)
+def _at_pairs(problem: Problem, partition: Partition, given: GivenRows, of: Program) -> Floats:
+    """Return what a program makes of state and control at every pair."""
+    (found,) = of(_pairs(problem, partition, given))
     return np.asarray(np.broadcast_to(found, given.pairs), dtype=np.float64)
 
 

@@ -104,10 +104,7 @@ class Sampler:
         self.samples = len(self.points) * len(self.nodes.weights)
         self.true_map = TrueMap(problem, partition)
         self.guard = guard = partial(Deadline.of(deadline).raise_if_over, doing)
-        admitted = problem.admitted()
-        self._admitted = (
-            None if admitted is None else Program([admitted], problem.system.constants())
-        )
+        self._admitted = problem.admitted()
         step, cost = _written(problem, self.true_map.map), problem.stage()
         self.step = partial(step, guard=guard)
         self.cost = None if cost is None else partial(cost, guard=guard)
@@ -277,7 +274,7 @@ def _written(problem: Problem, step: StateMap) -> StateMap:
     """Return the map as one program where it can be written out: the same, with fewer arrays."""
     if step.formulas is None or isinstance(step, Program):
         return step
-    return Program(step.formulas, problem.system.constants())
+    return problem.program(*step.formulas)
 
 
 def _split(
@@ -293,7 +290,7 @@ def _split(
     if not isinstance(cost, Program):
         return images, None
     if images is not None:
-        joint = Program([*step.formulas, *cost.formulas], problem.system.constants())
+        joint = problem.program(*step.formulas, *cost.formulas)
         both = Lines.of(joint, problem.controls)
         if both is not None:
             return both, both
