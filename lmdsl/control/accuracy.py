@@ -39,7 +39,7 @@ class IntegrationError(Reported):
         Difference to the accurate integrator.
     cost_halving
         Of a cost rate: relative difference of the costs of all pairs whose path is no escape to
-        those by twice as many substeps until the same moment. None without a rate.
+        those by twice as many substeps until the same moment. None without a rate, or such a pair.
     cost_accurate
         The same to what the accurate integrator makes of some pairs, until it enters A.
     given_up
@@ -106,14 +106,13 @@ class IntegrationError(Reported):
 
     def sentence(self) -> str:
         """Return one line for people."""
+        text = f"99 % of the steps within {self.largest:.2g} cell widths of the equation"
         if self.accurate is None or self.halving is None:
             text = "no sample stays in the box"
         elif self.largest == np.inf:
             text = ""
-        else:
-            text = f"99 % of the steps within {self.largest:.2g} cell widths of the equation"
-        if self.cost_halving is not None and self.largest_of_costs <= COST_TOO_MUCH:
-            text += f", their costs within {self._percent()} %" * bool(text)
+        elif self.cost_halving is not None and self.largest_of_costs <= COST_TOO_MUCH:
+            text += f", their costs within {self._percent()} %"
         return "; ".join(part for part in (text, self.warning()) if part)
 
     __str__ = sentence
@@ -141,7 +140,7 @@ def integration_error(
         halving = pairs.apart(images, pairs.images(2 * count))
         accurate = pairs.apart(images, pairs.ends)
     rates = pairs.quadrature(count)
-    if rates is not None:
+    if rates is not None and len(rates.rows):
         cost_halving, cost_accurate = rates.halving, _missed(pairs, rates)
     return IntegrationError(
         count, pairs.count, halving, accurate, cost_halving, cost_accurate, pairs.given_up

@@ -78,7 +78,8 @@ class Simulation(Frozen):
         if not self.aimed:
             few = ": too few samples, or too large cells" * (self.lost > FEW * self.starts)
             steps, lost = f"{self.steps_made:,} steps", f"{self.lost:,} of {self.starts:,}"
-            return f"{self.followed}: discounted, no target; {lost} runs are lost in {steps}{few}"
+            text = f"{self.followed}: discounted, no target; {lost} runs are lost in {steps}{few}"
+            return text + (f"; mean cost {self._mean()}" if self.cost else "")
         parts = [f"{self.followed}: {self.reached:,} of {self.starts:,} runs arrive"]
         parts += [f"{self.lost:,} {'is' if self.lost == 1 else 'are'} lost"] * bool(self.lost)
         parts += [f"{self.cycling:,} cycle{'s'[self.cycling != 1 :]}"] * bool(self.cycling)
@@ -130,13 +131,18 @@ class Simulation(Frozen):
     __str__ = text
 
     def _paid(self, cost: MeanCost) -> str:
-        """Return what runs paid in the mean, and what that lacks."""
-        error, cut_off, count = cost["standard_error"], cost["cut_off"], cost["runs"]
+        """Return what runs paid in the mean, whose it is, and what it lacks."""
         whose = {self.starts: "all runs   ", self.reached: "the reached"}
-        text = f"  cost of {whose.get(int(count or 0), 'runs kept  ')}    {cost['mean']:.6g}"
-        text += "" if error is None else f" +- {error:.2g} (standard error)"
+        label = whose.get(int(cost["runs"] or 0), "runs kept  ")
+        cut_off = cost["cut_off"]
         later = f", and {cut_off:.2g} more at most after {self.steps_made} steps"
-        return text + later * bool(cut_off)
+        return f"  cost of {label}    {self._mean()}{later if cut_off else ''}"
+
+    def _mean(self) -> str:
+        """Return the mean cost and its standard error."""
+        assert self.cost is not None
+        mean, error = self.cost["mean"], self.cost["standard_error"]
+        return f"{mean:.6g}" + ("" if error is None else f" +- {error:.2g} (standard error)")
 
     def _causes(self) -> str:
         """Return by what runs were lost, in brackets; empty where none was."""

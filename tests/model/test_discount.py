@@ -242,6 +242,7 @@ def test_what_is_said(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "discount      0.9: discounted, no target" in said
     assert "true map: discounted, no target; 0 of 1,000 runs are lost" in said
+    assert "; mean cost " in said
     assert "arrive" not in said
     path.write_text(json.dumps(steps(discount=0.5)))
     assert main(["solve", str(path)]) == 0
