@@ -13,7 +13,7 @@ from lmdsl.common.types import Bools, Floats, Guard, Statuses
 from lmdsl.control.steps import Moved
 from lmdsl.machine.kernels import fixed, kernel
 from lmdsl.model.assembly.paths.arcs import free_room
-from lmdsl.model.grid.axis import on_circle, on_interval
+from lmdsl.model.grid.axis import number_on
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
 from lmdsl.systems.accurate import ATTEMPTS, AccurateFlow, Arc, place, places
@@ -154,12 +154,7 @@ def _cell(start, bends, i, t, axes):  # type: ignore[no-untyped-def]
     """Return the cell of run i at time t of its arc, NaN outside."""
     index = 0.0
     for k in range(len(axes)):
-        x = place(start, bends, k, i, t)
-        low, high, width, cells = axes[k, 0], axes[k, 1], axes[k, 2], axes[k, 3]
-        if axes[k, 5] > 0.0:
-            index += axes[k, 4] * on_circle(x, low, high, width, cells)
-        else:
-            index += axes[k, 4] * on_interval(x, low, high, width, cells, False)
+        index += number_on(axes, k, place(start, bends, k, i, t))
     return index
 
 

@@ -134,6 +134,15 @@ def on_interval(x, low, high, width, cells, clip):  # type: ignore[no-untyped-de
 
 
 @kernel
+def number_on(axes, k, x):  # type: ignore[no-untyped-def]
+    """Return what x on axis k adds to the number of a cell, NaN outside; ``axes`` as an array."""
+    low, high, width, cells, stride = axes[k, 0], axes[k, 1], axes[k, 2], axes[k, 3], axes[k, 4]
+    if axes[k, 5] > 0.0:
+        return stride * on_circle(x, low, high, width, cells)
+    return stride * on_interval(x, low, high, width, cells, False)
+
+
+@kernel
 def circle(image, low, high, width, cells, stride, index):  # type: ignore[no-untyped-def]
     """Add the indices on a circle, times the stride."""
     for i in range(len(image)):

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats
 from lmdsl.machine.kernels import kernel
-from lmdsl.model.grid.axis import on_circle, on_interval
+from lmdsl.model.grid.axis import number_on
 
 MOST_PARTS = 1_000  # most parts of an arc; else twice as many as its steepest end is cells long
 
@@ -104,12 +104,7 @@ def _cell(state, slope, s, t, i, axes):  # type: ignore[no-untyped-def]
     """Return the cell of sample i at time t of arc s, NaN outside."""
     index = 0.0
     for k in range(len(axes)):
-        x = _hermite(state, slope, s, t, k, i)
-        low, high, width, cells = axes[k, 0], axes[k, 1], axes[k, 2], axes[k, 3]
-        if axes[k, 5] > 0.0:
-            index += axes[k, 4] * on_circle(x, low, high, width, cells)
-        else:
-            index += axes[k, 4] * on_interval(x, low, high, width, cells, False)
+        index += number_on(axes, k, _hermite(state, slope, s, t, k, i))
     return index
 
 
