@@ -1,6 +1,14 @@
 """``check``, ``gamma-max``, ``explain``: what looks wrong, what can be stabilized, why not all."""
 
-from lmdsl.cli.output import Arguments, Command, ProgressLine, answer, print_json, shared
+from lmdsl.cli.output import (
+    Arguments,
+    Command,
+    ProgressLine,
+    answer,
+    print_json,
+    problem_at,
+    shared,
+)
 from lmdsl.cli.streams import say
 
 
@@ -25,9 +33,8 @@ def add(command: Command) -> None:
 
 def _check(parsed: Arguments) -> int:
     from lmdsl.advice.checking import check
-    from lmdsl.problem.problem import load
 
-    problem = load(parsed.file)
+    problem = problem_at(parsed.file)
     with ProgressLine() as progress:
         found = check(problem, time_limit=parsed.time_limit, progress=progress)
     answer(parsed, found)
@@ -36,9 +43,8 @@ def _check(parsed: Arguments) -> int:
 
 def _gamma_max(parsed: Arguments) -> int:
     from lmdsl.optimize.feasibility.gamma_bar import gamma_max
-    from lmdsl.problem.problem import load
 
-    problem = load(parsed.file)
+    problem = problem_at(parsed.file)
     with ProgressLine() as progress:
         found = gamma_max(problem, progress, parsed.time_limit, parsed.width)
     answer(parsed, found)
@@ -47,9 +53,8 @@ def _gamma_max(parsed: Arguments) -> int:
 
 def _explain(parsed: Arguments) -> int:
     from lmdsl.explanation.causes import explain
-    from lmdsl.problem.problem import load
 
-    problem = load(parsed.file)
+    problem = problem_at(parsed.file)
     with ProgressLine() as progress:
         limit = parsed.time_limit
         found = explain(problem, phase_one=parsed.phase_one, time_limit=limit, progress=progress)

@@ -18,7 +18,7 @@ Run = Callable[[Arguments], int]
 Command = Callable[[str, Run, str], argparse.ArgumentParser]
 
 SHARED: dict[str, dict[str, Any]] = {
-    "file": {"metavar": "FILE", "help": "problem file"},
+    "file": {"metavar": "FILE", "help": "problem file, or a result directory: its problem"},
     "dir": {"metavar": "DIR", "help": "result directory"},
     "--time-limit": {"type": float, "metavar": "S", "help": "seconds"},
     "--json": {"action": "store_true", "help": "print one JSON object on stdout"},
@@ -29,6 +29,19 @@ def shared(sub: argparse.ArgumentParser, *options: str) -> None:
     """Add options that several commands have."""
     for option in options:
         sub.add_argument(option, **SHARED[option])
+
+
+def problem_at(path: str) -> Any:
+    """Return the problem of a file, or of a result directory."""
+    from lmdsl.common import inputs
+
+    if inputs.path(path).is_dir():
+        from lmdsl.results.directory.archive import problem_of
+
+        return problem_of(path)
+    from lmdsl.problem.problem import load
+
+    return load(path)
 
 
 def print_json(data: Any, indent: int | None = None) -> None:

@@ -6,7 +6,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lmdsl.cli.output import Arguments, Command, ProgressLine, answer, print_json, shared
+from lmdsl.cli.output import (
+    Arguments,
+    Command,
+    ProgressLine,
+    answer,
+    print_json,
+    problem_at,
+    shared,
+)
 from lmdsl.cli.streams import say, tell
 from lmdsl.errors import LmdslError, plain_text, printable
 from lmdsl.results.status import Status
@@ -49,9 +57,7 @@ def _problem_options(sub: argparse.ArgumentParser) -> None:
 
 
 def _problem(parsed: Arguments) -> Any:
-    from lmdsl.problem.problem import load
-
-    problem = load(parsed.file)
+    problem = problem_at(parsed.file)
     return problem if parsed.gamma is None else problem.replaced(gamma=parsed.gamma)
 
 

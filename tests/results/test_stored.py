@@ -100,7 +100,7 @@ def test_a_word_of_a_result_is_plain_text(tmp_path):
 def test_what_a_certificate_says_is_what_a_result_holds():
     """A key of the report is saved and read again where the certificate names it, and it does."""
     apart = {"format", "claims", "measure_residual", "reasons", "versions", "scope"}
-    held = {field.name for field in fields(lm.Result)} | {"beyond_gamma"}
+    held = {field.name for field in fields(lm.Result)} | {"beyond_gamma", "reward"}
     keys = {*CertificateFile.model_fields}
     assert keys - apart <= held
     assert {field.name for field in fields(Summary)} - {"simulation", "integration_error"} <= keys
@@ -143,6 +143,7 @@ def test_every_field_of_the_certificate(saved):
                 "coverage",
                 "sure_cells",
                 "data",
+                "reward",
             )
             assert refused(saved) or key in earlier, key
     (saved / "certificate.json").write_bytes(reading.text(good))

@@ -76,3 +76,34 @@ def test_large_denominators_are_stored_and_exported(tmp_path):
     assert lm.verify(tmp_path / "out", exact=True).holds
     status, said = checked(exported(result, tmp_path))
     assert status == 0, said
+
+
+@pytest.mark.parametrize("targets", [(), (0,)])
+@pytest.mark.parametrize("status", ["verified", "unverified"])
+def test_another_best_reward_is_not_confirmed(targets, status, tmp_path):
+    """Without targets it stands in no row and no cost: only the reward knows it."""
+    rng = np.random.default_rng(5)
+    P = rng.dirichlet(np.ones(6), size=(2, 6))
+    problem = lm.from_matrices(P, rng.random((6, 2)), targets, discount=0.9, maximise=True)
+    limit = 1 if status == "unverified" else None
+    result = lm.solve(problem, max_iterations=limit)
+    out = tmp_path / "out"
+    result.save(out)
+    assert lm.verify(out).holds == result.verified
+    stored = json.loads((out / "problem.json").read_text())
+    best = stored["system"]["best_reward"]
+    certificate = json.loads((out / "certificate.json").read_text())
+    assert certificate["reward"] == result.reward
+    for other in (best * (1 + 1e-6), best + 1, 0.0, None):
+        system = {**stored["system"], "best_reward": other}
+        if other is None:
+            del system["best_reward"]
+        (out / "problem.json").write_text(json.dumps({**stored, "system": system}) + " ")
+        found = lm.verify(out)
+        assert not found.holds
+        assert any("reward is stored as" in reason for reason in found.reasons), found
+    # A directory saved before the key was: it is verified as it was.
+    (out / "problem.json").write_text(json.dumps(stored) + " ")
+    del certificate["reward"]
+    (out / "certificate.json").write_text(json.dumps(certificate, indent=1))
+    assert lm.verify(out).holds == result.verified

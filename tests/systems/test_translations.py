@@ -5,10 +5,13 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 import lmdsl as lm
 from lmdsl.errors import MissingDependency
+from lmdsl.formulas.language import parse
+from lmdsl.formulas.program import Program
 from lmdsl.systems.translated import systems, terms
 from lmdsl.systems.translated.terms import Piece, Untranslatable
 
@@ -59,9 +62,6 @@ def test_constants_are_finite(value):
 
 def test_conditions_and_their_opposites():
     """Every combination of two comparisons, at every pair of truth values."""
-    from lmdsl.formulas.language import parse
-    from lmdsl.formulas.program import Program
-
     first, second = terms.comparison(A, "<", terms.ONE), terms.comparison(B, ">=", terms.ONE)
     for choice, holds in (
         (terms.both(first, second), lambda p, q: p and q),
@@ -77,6 +77,25 @@ def test_conditions_and_their_opposites():
                 for b in (0.0, 2.0):
                     value = formula({"a": a, "b": b})[0]
                     assert value == (10 if bool(holds(a < 1, b >= 1)) is wanted else 20)
+
+
+SMALL = np.concatenate([10.0 ** np.arange(-300, 0, 7), np.linspace(1e-3, 1, 40)])
+WIDE = np.concatenate([-SMALL, SMALL])
+
+
+@pytest.mark.parametrize(("name", "at"), [
+    ("expm1", np.concatenate([WIDE, np.linspace(-745, 709, 60)])),
+    ("log1p", np.concatenate([WIDE[WIDE > -1] * 0.999, 10.0 ** np.arange(1, 300, 9)])),
+    ("asinh", np.concatenate([WIDE, 10.0 ** np.arange(1, 150, 9)])),
+    ("acosh", np.concatenate([1 + SMALL, 10.0 ** np.arange(1, 150, 9)])),
+    ("atanh", np.concatenate([WIDE[abs(WIDE) < 1], 1 - 10.0 ** -np.arange(1, 15), [-0.99999]])),
+])  # fmt: skip
+def test_functions_that_are_written_out_lose_no_digits(name, at):
+    """Where exp(x) - 1 or log(1 + x) would keep none: at 1e-300, and everywhere between."""
+    formula = Program([parse(getattr(terms, name)(A).text, ("a",))])
+    exact = {"asinh": np.arcsinh, "acosh": np.arccosh, "atanh": np.arctanh}
+    wanted = exact.get(name, getattr(np, name, None))(at)
+    np.testing.assert_allclose(formula({"a": at})[0], wanted, rtol=2e-15)
 
 
 def test_formulas_that_are_refused_are_no_translation():

@@ -194,6 +194,14 @@ def read(path: str | os.PathLike[str]) -> Stored:
     return reading.read(Path(path), _read)
 
 
+def problem_of(path: str | os.PathLike[str]) -> Problem:
+    """Read the problem of a result directory, a finite model with its rows.
+
+    BadInput: it is unreadable, or its files are of several saves.
+    """
+    return reading.read(Path(path), _own_problem)
+
+
 def read_model(
     path: str | os.PathLike[str], result: Result, expected: Mapping[str, Any]
 ) -> dict[str, NDArray[Any]]:
@@ -212,8 +220,7 @@ def _arrays(files: Reading, name: str, expected: arrays.Expected) -> dict[str, N
 
 
 def _read(files: Reading) -> Stored:
-    content = files.open("problem.json", MAX_FILE_BYTES).read()
-    problem = _problem(parsed(files.folder / "problem.json", content), files)
+    problem = _own_problem(files)
     stored = CertificateFile.read(files.certificate)
     partition = Partition.of(problem)
     N = partition.size
@@ -243,6 +250,11 @@ def _result(
         **known, problem=problem, partition=partition, certificate=certificate,
         control_vectors=vectors,
     )  # fmt: skip
+
+
+def _own_problem(files: Reading) -> Problem:
+    content = files.open("problem.json", MAX_FILE_BYTES).read()
+    return _problem(parsed(files.folder / "problem.json", content), files)
 
 
 def _problem(data: Any, files: Reading) -> Problem:

@@ -58,10 +58,21 @@ def differences(
     beyond = jsonable(result.beyond_gamma)
     if "beyond_gamma" in certificate.model_fields_set and certificate.beyond_gamma != beyond:
         reasons.append("beyond_gamma is not the cells that solution.npz names")
+    if "reward" in certificate.model_fields_set:
+        reasons += _reward(certificate.reward, result.reward)
     if certificate.scope != scope(result.problem):
         reasons.append("scope is not what verified speaks of")
     reasons += data_differences(lp, result)
     return reasons + _bracket(whole, result, found)
+
+
+def _reward(stored: float | None, found: float | None) -> list[str]:
+    """Compare the reward, which follows from the cost and the problem's ``best_reward``."""
+    if stored is None or found is None:
+        return [] if stored is found else [_differs("reward", stored, found)]
+    if math.isclose(stored, found, rel_tol=1e-12, abs_tol=1e-300):
+        return []
+    return [f"{_differs('reward', stored, found)} by best_reward and cost"]
 
 
 def _differs(name: str, stored: Any, found: Any) -> str:

@@ -68,6 +68,7 @@ class CertificateFile(_Keys):
     gamma: float | None
     cost: float | None
     lower_bound: float | None
+    reward: float | None = None
     gap: float | None
     tolerance: Annotated[float, Field(ge=0)]
     contraction: float | None

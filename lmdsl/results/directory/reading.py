@@ -39,7 +39,8 @@ def read(folder: Path, what: Callable[["Reading"], T]) -> T:
     BadInput: the directory is unreadable, or its files are of several saves.
     """
     if not folder.is_dir():
-        raise BadInput(f"{shown(str(folder), 200)} is not a result directory")
+        hint = "; `lmdsl solve FILE --out DIR` makes one" if folder.is_file() else ""
+        raise BadInput(f"{shown(str(folder), 200)} is not a result directory{hint}")
     for attempt in range(TRIES):
         before = plain(folder / COMMIT)
         try:

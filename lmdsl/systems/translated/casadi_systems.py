@@ -22,8 +22,8 @@ UNARY: dict[str, Callable[[Piece], Piece]] = {
     "ASINH": terms.asinh,
     "ACOSH": terms.acosh,
     "ATANH": terms.atanh,
-    "LOG1P": lambda a: terms.call("log", terms.add(terms.number(1), a)),
-    "EXPM1": lambda a: terms.subtract(terms.call("exp", a), terms.number(1)),
+    "LOG1P": terms.log1p,
+    "EXPM1": terms.expm1,
     "ASSIGN": lambda a: a,
     **{
         name.upper(): partial(terms.call, name)

@@ -37,6 +37,8 @@ OTHER: dict[str, Callable[..., Piece]] = {
     "asinh": terms.asinh,
     "acosh": terms.acosh,
     "atanh": terms.atanh,
+    "expm1": terms.expm1,
+    "log1p": terms.log1p,
 }
 
 

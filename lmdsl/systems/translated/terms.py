@@ -136,22 +136,35 @@ def truncated(a: Piece, b: Piece) -> Piece:
     return multiply(call("sign", a), rest)
 
 
+def expm1(a: Piece) -> Piece:
+    """Return exp(a) - 1 without its loss of digits near 0."""
+    return multiply(call("tanh", divide(a, number(2))), add(call("exp", a), ONE))
+
+
+def log1p(a: Piece) -> Piece:
+    """Return log(1 + a) without its loss of digits near 0: what 1 + a is rounded by is added."""
+    u = add(ONE, a)
+    return subtract(call("log", u), divide(subtract(subtract(u, ONE), a), u))
+
+
 def asinh(a: Piece) -> Piece:
     """Return the inverse of sinh."""
-    size = call("abs", a)
-    root = call("sqrt", add(power(size, number(2)), ONE))
-    return multiply(call("sign", a), call("log", add(size, root)))
+    size, square = call("abs", a), power(a, number(2))
+    root = call("sqrt", add(square, ONE))
+    return multiply(call("sign", a), log1p(add(size, divide(square, add(ONE, root)))))
 
 
 def acosh(a: Piece) -> Piece:
     """Return the inverse of cosh."""
-    root = call("sqrt", subtract(power(a, number(2)), ONE))
-    return call("log", add(a, root))
+    t = subtract(a, ONE)
+    return log1p(add(t, call("sqrt", multiply(t, add(a, ONE)))))
 
 
 def atanh(a: Piece) -> Piece:
     """Return the inverse of tanh."""
-    return divide(call("log", divide(add(ONE, a), subtract(ONE, a))), number(2))
+    size = call("abs", a)
+    ratio = divide(multiply(number(2), size), subtract(ONE, size))
+    return divide(multiply(call("sign", a), log1p(ratio)), number(2))
 
 
 def comparison(a: Piece, operator: str, b: Piece) -> Choice:
