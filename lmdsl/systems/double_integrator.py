@@ -27,7 +27,7 @@ class DoubleIntegrator(NamedMap):
             "x": {"low": -2, "high": 2, "cells": 80},
             "v": {"low": -1.5, "high": 1.5, "cells": 60},
         },
-        "attractor": {"points": [{"x": 0, "v": 0}]},
+        "attractor": {"boxes": [{"x": [-0.05, 0.05], "v": [-0.05, 0.05]}]},
         "control_grid": {"u": {"low": -1, "high": 1, "points": 5}},
         "stage_cost": "h",
         "sampling": {"kind": "grid", "per_axis": 4},

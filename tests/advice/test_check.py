@@ -136,9 +136,14 @@ def test_steps_that_miss_the_equation():
 # Attractors ------------------------------------------------------------------------------------
 
 
+def at_a_point():
+    """The shipped double integrator, with the point in its attractor's middle as attractor."""
+    return lm.load("examples/double_integrator.json").replaced(attractor={"points": [[0, 0]]})
+
+
 def test_an_attractor_of_points_that_shrinks_with_the_cells():
     # 88, 59, 30, 15 % stabilizable on 1, 2, 4, 8 times the cells an axis.
-    problem = lm.load("examples/double_integrator.json")
+    problem = at_a_point()
     (finding,) = lm.check(problem).findings
     assert finding.code == "shrinking_attractor"
     shares = finding.figures["shares"]
@@ -146,8 +151,10 @@ def test_an_attractor_of_points_that_shrinks_with_the_cells():
     assert shares["160 x 120 cells"] == pytest.approx(0.59, abs=0.01)
     boxes = finding.figures["boxes"]
     assert boxes == [{"x": (-0.05, 0.05), "v": (-0.05, 0.05)}]
-    # A box is the cure.
+    # A box is the cure: the one that is shipped, with the same cells as the point.
     box = problem.replaced(attractor={"boxes": boxes})
+    assert box == lm.load("examples/double_integrator.json")
+    assert lm.compile(box).digest == lm.compile(problem).digest
     assert not lm.check(box)
     axes = {name: axis.replaced(cells=2 * axis.cells) for name, axis in problem.state_box.items()}
     lp = lm.compile(box.replaced(state_box=axes))
@@ -157,7 +164,7 @@ def test_an_attractor_of_points_that_shrinks_with_the_cells():
 
 
 def test_a_box_for_an_attractor_that_has_shrunk_already():
-    problem = lm.load("examples/double_integrator.json")
+    problem = at_a_point()
     axes = {name: axis.replaced(cells=4 * axis.cells) for name, axis in problem.state_box.items()}
     findings = {f.code: f for f in lm.check(problem.replaced(state_box=axes)).findings}
     figures = findings["shrinking_attractor"].figures

@@ -85,7 +85,7 @@ def test_a_periodic_axis_for_an_angle():
 
 
 def test_a_box_as_attractor_for_points_that_shrank():
-    problem = lm.load("examples/double_integrator.json")
+    problem = lm.load("examples/double_integrator.json").replaced(attractor={"points": [[0, 0]]})
     axes = {name: axis.replaced(cells=2 * axis.cells) for name, axis in problem.state_box.items()}
     fine = problem.replaced(state_box=axes)
     hint = hints(fine)["box attractor"]
