@@ -242,6 +242,21 @@ def test_a_file_of_storm(tmp_path):
         lm.from_matrices(path, "steps", targets="goal")
 
 
+def test_a_reward_model_without_a_name(tmp_path):
+    """Storm writes a blank for its name; what is paid counts all the same."""
+    path = tmp_path / "model.drn"
+    text = STORM.replace("steps energy\n", " \n")
+    path.write_text(text.replace("[0, 1]", "[1]").replace("[1, ", "[").replace("[0, 0]", "[0]"))
+    result = lm.solve(lm.from_matrices(path, targets="done"))
+    V0 = (1.5 + 0.6) / (1 - 0.1)  # as above
+    np.testing.assert_allclose(result.value, [V0, 2 + V0 / 3, 0], rtol=1e-8)
+    with pytest.raises(lm.BadInput, match="'steps' is no reward model of the file; it has none"):
+        lm.from_matrices(path, "steps", targets="done")
+    path.write_text(text)
+    with pytest.raises(lm.BadInput, match="2 rewards for 1 reward models; give each a name"):
+        lm.from_matrices(path, targets="done")
+
+
 @pytest.mark.parametrize(("old", "new", "words"), [
     ("@type: MDP", "@type: CTMC", "line 3: the type is 'CTMC'"),
     ("@parameters\n\n", "@parameters\np q\n", "parameters have no values"),

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 from certificate_files import noisy, parsed
+from model_checker import COSTS, PRECISION, answer, built, newer, package, read, written
 from models import random_lp
 from problems import doubling, made, standard_map, steps
 
@@ -75,28 +77,10 @@ def test_what_storm_cannot_hold_is_refused(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-PRECISION = 1e-6
-"""Storm's stated default, relative to the value; a bound of the error with sound methods only."""
-
-
-def storm_values(path, exact=False):
-    """The least expected cost of every state by Storm, whose interface changed with version 2."""
-    stormpy = pytest.importorskip("stormpy", reason="Storm is not installed")
-    property_ = stormpy.parse_properties('R{"cost"}min=? [F "attractor"]')[0]
-    if exact:
-        if not hasattr(stormpy, "Rational") or not hasattr(stormpy, "environments"):
-            pytest.skip("this version of stormpy reads DRN files as doubles only")
-        model = stormpy.build_model_from_drn[stormpy.Rational](str(path))
-    else:
-        model = stormpy.build_model_from_drn(str(path))
-    if hasattr(stormpy, "environments"):  # sound, or exact for an exact model, by default
-        found = stormpy.model_checking(model, property_)
-    else:
-        environment = stormpy.Environment()
-        environment.solver_environment.set_force_sound(True)
-        found = stormpy.model_checking(model, property_, environment=environment)
-    values = found.get_value_vector() if hasattr(found, "get_value_vector") else found.get_values()
-    return model, [Fraction(str(v)) if exact else float(v) for v in values]
+def storm_values(path, exact=False, question=COSTS):
+    """The least expected cost of every state, by Storm."""
+    model = read(path, exact)
+    return model, answer(model, question, exact)
 
 
 def test_storm_agrees(at_one):
@@ -132,3 +116,119 @@ def test_storm_agrees_on_random_models(zero, tmp_path):
         np.testing.assert_allclose(
             values[:-1], result.value[result.lp.cells], rtol=PRECISION, atol=1e-9
         )
+
+
+def test_storm_agrees_where_runs_end_by_discount(tmp_path):
+    result = lm.solve(made({**noisy(), "discount": 0.9}))
+    export_drn(result.lp, tmp_path / "model.drn")
+    question = 'R{"cost"}min=? [F "attractor" | "ended"]'
+    _, values = storm_values(tmp_path / "model.drn", question=question)
+    assert values[-2:] == [0, 0]
+    np.testing.assert_allclose(values[:-2], result.value[result.lp.cells], rtol=PRECISION)
+
+
+# Models of Storm's ----------------------------------------------------------------------------
+
+# Two dice of fair coins (Knuth, Yao), thrown in any order: the known mean is 22/3.
+DICE = """mdp
+module one
+  s : [0..7] init 0;
+  [] s=0 -> 0.5 : (s'=1) + 0.5 : (s'=2);
+  [] s=1 -> 0.5 : (s'=3) + 0.5 : (s'=4);
+  [] s=2 -> 0.5 : (s'=5) + 0.5 : (s'=6);
+  [] s=3 -> 0.5 : (s'=1) + 0.5 : (s'=7);
+  [] s=4 | s=5 -> 1 : (s'=7);
+  [] s=6 -> 0.5 : (s'=2) + 0.5 : (s'=7);
+endmodule
+module two = one [s=t] endmodule
+rewards "flips"
+  [] true : 1;
+endrewards
+label "goal" = s=7 & t=7;
+"""
+
+# Rewards without a name, of states and of actions, named actions, thirds, a way of no return.
+WALK = """mdp
+module walker
+  x : [0..9] init 3;
+  [slow] x>0 & x<7 -> 2/3 : (x'=x+1) + 1/3 : (x'=x-1);
+  [fast] x>0 & x<6 -> 3/7 : (x'=x+2) + 4/7 : (x'=x-1);
+  [jump] x=2 -> 1/2 : (x'=7) + 1/2 : (x'=8);
+  [back] x=0 -> 1 : (x'=1);
+  [lost] x=8 -> 1 : (x'=9);
+  [lost] x=9 -> 1 : (x'=8);
+endmodule
+rewards
+  x<7 : 1/2;
+  [fast] true : 0.3;
+  [back] true : 5;
+endrewards
+label "goal" = x=7;
+"""
+
+# A chain: a gambler with a fair coin leaves with 6 or with nothing, after x (6 - x) throws.
+GAMBLER = """dtmc
+module gambler
+  x : [0..6] init 2;
+  [] x>0 & x<6 -> 1/2 : (x'=x+1) + 1/2 : (x'=x-1);
+  [] x=0 | x=6 -> true;
+endmodule
+rewards "throws"
+  x>0 & x<6 : 1;
+endrewards
+label "goal" = x=0 | x=6;
+"""
+
+# Of PRISM's benchmarks, as they come with stormpy: reward model, label of the goal, the answer.
+SHIPPED = {
+    "mdp/two_dice.nm": ("coinflips", "done", Fraction(22, 3)),
+    "mdp/coin2-2.nm": ("steps", "finished", 48),
+    "mdp/csma2_2.nm": ("time", "all_delivered", Fraction(53954981353, 805306368)),
+    "mdp/maze_2.nm": (None, "goal", Fraction(66, 13)),
+    "dtmc/leader3_5.pm": ("num_rounds", "elected", Fraction(25, 24)),
+}
+OURS = {
+    "dice": (DICE, "flips", Fraction(22, 3)),
+    "walk": (WALK, None, None),
+    "gambler": (GAMBLER, "throws", 8),
+}
+
+
+@pytest.mark.parametrize("exact", [False, True])
+@pytest.mark.parametrize("name", [*OURS, *SHIPPED])
+def test_a_model_of_prism_goes_there_and_back(name, exact, tmp_path):
+    """PRISM's language -> Storm -> DRN -> lmdsl -> DRN -> Storm: one least cost in all states."""
+    if name in OURS:
+        text, reward, known = OURS[name]
+        program, goal = tmp_path / "program.nm", "goal"
+        program.write_text(text)
+    else:
+        reward, goal, known = SHIPPED[name]
+        program = Path(package().__file__).parent / "examples/files" / name
+    model = built(program, exact)
+    named = f'{{"{reward}"}}' * (reward is not None)
+    theirs = answer(model, f'R{named}min=? [F "{goal}"]', exact)
+    written(model, tmp_path / "theirs.drn")
+
+    result = lm.solve(lm.from_matrices(tmp_path / "theirs.drn", reward, targets=goal))
+    assert result.status == "verified"
+    plain = np.array([float(v) for v in theirs])
+    # Storm rounds probabilities to ten digits where it writes doubles.
+    np.testing.assert_allclose(result.value, plain, rtol=1e-8 if exact else PRECISION, atol=1e-12)
+    (start,) = model.initial_states
+    assert result.cost == pytest.approx(plain[start], rel=1e-8 if exact else PRECISION)
+    if known is not None:
+        assert result.cost == pytest.approx(float(known), rel=1e-8)
+    if exact:
+        for V, lower, upper in zip(theirs, result.lower, result.value, strict=True):
+            assert V == upper == np.inf or Fraction(float(lower)) <= V <= Fraction(float(upper))
+
+    export_drn(result.lp, tmp_path / "ours.drn")
+    exact &= newer()  # which alone reads exact DRN files
+    again, values = storm_values(tmp_path / "ours.drn", exact)
+    lp = result.lp
+    assert list(again.initial_states) == np.flatnonzero(lp.weight).tolist()
+    if exact:
+        assert values[:-1] == [theirs[cell] for cell in lp.cells]
+    else:
+        np.testing.assert_allclose(values[:-1], plain[lp.cells], rtol=PRECISION, atol=1e-12)

@@ -118,7 +118,7 @@ def _require_told(found: Explicit) -> None:
             raise _fault(number, says)
 
 
-def _place(models: list[str], wanted: str | None) -> int | None:
+def _place(models: list[str], wanted: str | None) -> int:
     if wanted is not None:
         if wanted not in models:
             raise BadInput(
@@ -127,11 +127,12 @@ def _place(models: list[str], wanted: str | None) -> int | None:
         return models.index(wanted)
     if len(models) > 1:
         raise BadInput(f"the file has the reward models {models}; name one", "cost")
-    return 0 if models else None
+    return 0
 
 
-def _read_states(lines: Numbered, found: Explicit, place: int | None) -> None:
-    own, rewards = Fraction(0), len(found.rewards)
+def _read_states(lines: Numbered, found: Explicit, place: int) -> None:
+    # Where none is named there may be one all the same: Storm's without a name.
+    own, rewards = Fraction(0), len(found.rewards) or 1
     for number, line in lines:
         words = line.split("//")[0].replace("[", " [ ").replace("]", " ] ").split()
         if not words:
@@ -159,9 +160,7 @@ def _read_states(lines: Numbered, found: Explicit, place: int | None) -> None:
             raise _fault(number, f"{shown(line.strip(), 80)} is not read")
 
 
-def _bracket(
-    words: list[str], place: int | None, count: int, number: int
-) -> tuple[Fraction, list[str]]:
+def _bracket(words: list[str], place: int, count: int, number: int) -> tuple[Fraction, list[str]]:
     """Return the reward in brackets, 0 without, and the words behind."""
     if words[:1] != ["["]:
         return Fraction(0), words
@@ -169,10 +168,11 @@ def _bracket(
         raise _fault(number, "a bracket is not closed")
     end = words.index("]")
     inside = "".join(f"{word} " for word in words[1:end]).replace(",", " ").split()
-    if place is None or not inside:
+    if not inside:
         return Fraction(0), words[end + 1 :]
     if len(inside) != count:
-        raise _fault(number, f"{len(inside)} rewards for {count} reward models")
+        more = "; give each a name" * (len(inside) > count)
+        raise _fault(number, f"{len(inside)} rewards for {count} reward models{more}")
     return _number(inside[place], number), words[end + 1 :]
 
 
