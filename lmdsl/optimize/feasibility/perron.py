@@ -90,7 +90,7 @@ def _solved(M: Any, x: Floats, time_up: TimeUp, directions: Directions | None) -
         except np.linalg.LinAlgError:
             return None
     elif directions is None:
-        y = equations.solve(M, x, time_up=time_up)
+        y = equations.solve(M, x, time_up)
     else:
         scaled = M.copy()  # all sizes alike, as a Krylov method wants them
         scaled.data *= x[M.indices] / np.repeat(x, np.diff(M.indptr))

@@ -1,6 +1,7 @@
 """Optimal stopping: whether going on under weight gamma beats an end, cell by cell."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -52,22 +53,22 @@ def optimal_stopping(
     policy = lp.pair_pointer[:-1].copy() if policy is None else policy
     going = np.zeros(lp.n, dtype=np.bool_) if going is None else going
     try:
-        return _stopping(lp, gamma, reward, policy, going, time_up, limit)
+        return _stopping(_Asked(lp, gamma, reward, time_up), policy, going, limit)
     except Stopped:
         return None
 
 
-def _stopping(
-    lp: StabilizationLP,
-    gamma: float,
-    reward: Floats,
-    policy: Policy,
-    going: Bools,
-    time_up: TimeUp,
-    limit: int,
-) -> Stopping:
+class _Asked(NamedTuple):
+    lp: StabilizationLP
+    gamma: float
+    reward: Floats
+    time_up: TimeUp
+
+
+def _stopping(asked: _Asked, policy: Policy, going: Bools, limit: int) -> Stopping:
+    lp, gamma, reward, time_up = asked
     zero = np.zeros(lp.K)
-    w = _stopped(lp, gamma, reward, policy, going, reward, time_up)
+    w = _stopped(asked, policy, going, reward)
     if w is None:
         going = np.zeros(lp.n, dtype=np.bool_)
         w = reward
@@ -87,32 +88,25 @@ def _stopping(
             new_going = np.where(change, better.value <= reward, new_going)
         if lowered is w:
             return Stopping(np.minimum(w, reward), policy, going, True)
-        new = _stopped(lp, gamma, reward, new_pair, new_going, w, time_up)
+        new = _stopped(asked, new_pair, new_going, w)
         if new is None or not (new < w).any():
             break  # rounding made a change look better than it is
         w, policy, going = new, new_pair, new_going
     return Stopping(np.minimum(w, reward), policy, going, False)
 
 
-def _stopped(
-    lp: StabilizationLP,
-    gamma: float,
-    reward: Floats,
-    policy: Policy,
-    going: Bools,
-    before: Floats,
-    time_up: TimeUp,
-) -> Floats | None:
+def _stopped(asked: _Asked, policy: Policy, going: Bools, before: Floats) -> Floats | None:
     """Return the reward of a stopping policy: w = gamma P w where it goes, the reward elsewhere.
 
     It is solved in units of ``before``, as w may fall over many decades.
     """
+    lp, gamma, reward, time_up = asked
     w = reward.copy()
     if going.any():
         unit = np.maximum(before, LEAST_UNIT)
         P = gamma * lp.rows.matrix(policy[going])
         P.data *= unit[P.indices] / np.repeat(unit[going], np.diff(P.indptr))
-        new = equations.solve(P[:, going], P[:, ~going] @ (reward / unit)[~going], time_up=time_up)
+        new = equations.solve(P[:, going], P[:, ~going] @ (reward / unit)[~going], time_up)
         if new is None:
             return None
         w[going] = unit[going] * new

@@ -33,23 +33,15 @@ FEW_SWEEPS, MANY_SWEEPS = 100, 300
 PER_CORE = 20  # number of sweeps of the core for one of all cells above which all are swept again
 
 
-def solve(
-    M: Any,
-    b: Floats,
-    start: Floats | None = None,
-    enough: float = TOLERANCE,
-    flat: float = 0.0,
-    time_up: TimeUp = never,
-) -> Floats | None:
+def solve(M: Any, b: Floats, time_up: TimeUp = never) -> Floats | None:
     """Return x >= 0 with x = b + M x, or None where there is none (as far as rounding can tell).
 
-    M is a CSR array (n, n), b and the guess ``start`` have shape (n,), all entries >= 0. A sweep of
-    relative change ``enough``, or absolute change ``flat``, ends the work; so does ``time_up``,
-    asked after the first few sweeps, then between sweeps and classes, with Stopped.
+    M is a CSR array (n, n), b has shape (n,), all entries >= 0; ``time_up`` as in
+    :func:`solve_from`.
     """
-    x = np.array(b if start is None else start, dtype=np.float64)
+    x = np.array(b, dtype=np.float64)
     peeled = Peeled.of(SplitMatrix.of(M))
-    return x if solve_from(peeled, b, x, lambda: M, enough, flat, time_up) else None
+    return x if solve_from(peeled, b, x, lambda: M, time_up) else None
 
 
 def solve_from(
@@ -57,11 +49,13 @@ def solve_from(
     b: Floats,
     x: Floats,
     matrix: Callable[[], Any],
-    enough: float = TOLERANCE,
-    flat: float = 0.0,
     time_up: TimeUp = never,
 ) -> bool:
-    """Solve in place from a guess; ``matrix`` makes M, as a CSR array, where sweeps are slow."""
+    """Solve in place from a guess; ``matrix`` makes M, as a CSR array, where sweeps are slow.
+
+    ``time_up``, asked after the first few sweeps, then between sweeps and classes, ends the work
+    with Stopped.
+    """
     core, inner = peeled.core, peeled.inner
     whole = inner is peeled.system
 
@@ -69,7 +63,7 @@ def solve_from(
         return matrix() if whole else matrix()[core][:, core]
 
     guess, c = (x, b) if whole else (x[core], b[core])
-    y = _solve(inner, c, guess, part, enough, flat, time_up)
+    y = _solve(inner, c, guess, part, 0.0, time_up)
     if y is None:
         return False
     x[core] = y
@@ -81,11 +75,13 @@ def solve_transposed(
     b: Floats,
     matrix: Callable[[], Any],
     start: Floats | None = None,
-    enough: float = TOLERANCE,
     flat: float = 0.0,
     time_up: TimeUp = never,
 ) -> Floats | None:
-    """Return x >= 0 with x = b + M'x, or None; parameters as in :func:`solve_from`."""
+    """Return x >= 0 with x = b + M'x, or None; parameters as in :func:`solve_from`.
+
+    A sweep that moves no component by more than ``flat`` ends the work as well.
+    """
     x, core = b.copy(), peeled.core
     if not peeled.flow(x):
         return None
@@ -95,7 +91,7 @@ def solve_transposed(
         return matrix()[core][:, core].T.tocsr()
 
     c = x[core]
-    y = _solve(inner, c, c.copy() if start is None else start[core], part, enough, flat, time_up)
+    y = _solve(inner, c, c.copy() if start is None else start[core], part, flat, time_up)
     if y is None:
         return None
     x[core] = y
@@ -167,7 +163,6 @@ def _solve(
     b: Floats,
     x: Floats,
     matrix: Callable[[], Any],
-    enough: float,
     flat: float,
     time_up: TimeUp,
 ) -> Floats | None:
@@ -175,8 +170,8 @@ def _solve(
     nothing = ~_positive(system, b) if (b == 0).any() else None
     if nothing is not None:
         x[nothing] = 0.0  # exactly: a guess would only decay there
-    change, rate = _trial(system, b, x, enough, flat)
-    if change <= enough:
+    change, rate = _trial(system, b, x, flat)
+    if change <= TOLERANCE:
         return x
     guess = None
     if len(b) >= KRYLOV and not _soon(change, rate, FEW_SWEEPS):
@@ -185,8 +180,8 @@ def _solve(
         x = guess
         if nothing is not None:
             x[nothing] = 0.0
-        change, rate = _trial(system, b, x, enough, flat)
-        if change <= enough:
+        change, rate = _trial(system, b, x, flat)
+        if change <= TOLERANCE:
             return x
     if not _soon(change, rate, MANY_SWEEPS):
         direct, small_enough = solve_by_class(matrix(), b, time_up)
@@ -195,8 +190,8 @@ def _solve(
     for _ in range(MAX_SWEEPS // TRIAL_SWEEPS):
         if time_up():
             raise Stopped
-        change, rate = _trial(system, b, x, enough, flat)
-        if change <= enough:
+        change, rate = _trial(system, b, x, flat)
+        if change <= TOLERANCE:
             return x
         if not np.isfinite(change) or x.max() > CEILING:
             return None
@@ -259,10 +254,8 @@ def _soon(change: float, rate: float, sweeps: int) -> bool:
     return bool(np.log(TOLERANCE / change) / np.log(max(rate, 1e-300)) < sweeps)
 
 
-def _trial(
-    system: SplitMatrix, b: Floats, x: Floats, enough: float, flat: float
-) -> tuple[float, float]:
+def _trial(system: SplitMatrix, b: Floats, x: Floats, flat: float) -> tuple[float, float]:
     """Sweep; return the last relative change, and the factor by which a sweep shrinks it."""
-    halfway, last = system.sweep(b, x, TRIAL_SWEEPS, enough, flat)
+    halfway, last = system.sweep(b, x, TRIAL_SWEEPS, TOLERANCE, flat)
     rate = (last / halfway) ** (2 / TRIAL_SWEEPS) if 0 < halfway < np.inf else 0.0
     return last, rate
