@@ -25,6 +25,7 @@ PAIRS, FIRST = 10_000, 100  # pairs, and as many of them as are tried first
 QUANTILE = 0.99
 GOAL, MOST = 0.01, 1_000  # of automatic substeps: difference in cell widths, number of substeps
 COST_GOAL = 0.001  # of the integral of a cost rate, relative
+LARGEST = 2 ** int(np.log2(MOST))  # automatic substeps
 ATTEMPTS = MOST  # steps of the accurate integrator: where it takes more, so does Runge-Kutta
 
 
@@ -70,7 +71,7 @@ def needed(problem: Problem, deadline: Deadline | None = None) -> int:
 def _too_fast(problem: Problem) -> str:
     step = getattr(problem.system, "step", None)
     return (
-        f'"auto" finds no number up to {MOST:,}: the equation is so stiff, or so fast, that an '
+        f'"auto" finds no number up to {LARGEST}: the equation is so stiff, or so fast, that an '
         f"accurate integrator takes more than {ATTEMPTS:,} steps for one step of {step!r}; "
         "shorten step, let what settles at once be a formula of the others, or write a number of "
         "substeps to take what these make of it"
