@@ -70,17 +70,19 @@ class _Flaw:
         self.message = message
 
 
-def read_bytes(path: Path, limit: int = MAX_FILE_BYTES, links: bool = True) -> bytes:
-    """Read a regular file of at most ``limit`` bytes; BadInput says why it cannot be read."""
+def read_bytes(path: Path, links: bool = True) -> bytes:
+    """Read a regular file of MAX_FILE_BYTES at most; BadInput says why it cannot be read."""
     try:
         with open_regular(path, links) as file:
-            content = file.read(limit + 1)
+            content = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise BadInput(f"cannot read {shown(str(path), 200)}: {reason(error)}") from None
     except (TypeError, ValueError):
         raise BadInput(f"{shown(str(path), 200)} is not a path") from None
-    if len(content) > limit:
-        raise BadInput(f"{shown(str(path), 200)} is larger than the limit of {limit} bytes")
+    if len(content) > MAX_FILE_BYTES:
+        raise BadInput(
+            f"{shown(str(path), 200)} is larger than the limit of {MAX_FILE_BYTES} bytes"
+        )
     return content
 
 

@@ -38,9 +38,9 @@ def flag(value: Any, where: str) -> bool:
     return bool(value)
 
 
-def seed(value: Any, where: str = "seed") -> int:
+def seed(value: Any) -> int:
     """Return a seed of a random generator."""
-    return whole(value, where, 0, 2**63 - 1)
+    return whole(value, "seed", 0, 2**63 - 1)
 
 
 def path(value: Any, where: str = "path") -> Path:

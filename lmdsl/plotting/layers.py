@@ -37,6 +37,7 @@ REGIONS: dict[int, tuple[str, str, str | None]] = {
 
 # Number of runs of cells above which a region is drawn as an image, without hatch.
 MOST_RUNS = 5_000
+MOST_LEVELS = 11  # that a colour bar names
 
 
 def blank(columns: float = 1, rows: float = 1) -> Any:
@@ -254,9 +255,9 @@ def levels(ax: Any, view: View, values: Floats, grid: Floats, label: str) -> Non
     colour_bar.set_ticklabels([number(v) for v in level[kept]])
 
 
-def _thinned(n: int, zero: int, most: int = 11) -> Indices:
-    """Return at most so many of n levels, evenly spaced through ``zero``, with both ends if so."""
-    step = -(-n // most)
+def _thinned(n: int, zero: int) -> Indices:
+    """Return MOST_LEVELS of n at most, evenly spaced through ``zero``, with both ends if so."""
+    step = -(-n // MOST_LEVELS)
     both = [s for s in range(step, 2 * step) if zero % s == 0 and (n - 1 - zero) % s == 0]
     step = both[0] if both else step
     return np.arange(zero % step, n, step)

@@ -94,7 +94,6 @@ class Sampler:
         problem: Problem,
         partition: Partition,
         deadline: Deadline | None = None,
-        doing: str = "compiling",
         sets: CellSets | None = None,
     ) -> None:
         self.problem, self.partition = problem, partition
@@ -103,7 +102,7 @@ class Sampler:
         self.nodes = discretization.noise_nodes(problem)
         self.samples = len(self.points) * len(self.nodes.weights)
         self.true_map = TrueMap(problem, partition)
-        self.guard = guard = partial(Deadline.of(deadline).raise_if_over, doing)
+        self.guard = guard = partial(Deadline.of(deadline).raise_if_over, "compiling")
         self._admitted = problem.admitted()
         step, cost = _written(problem, self.true_map.map), problem.stage()
         self.step = partial(step, guard=guard)
