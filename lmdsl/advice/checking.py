@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from lmdsl.advice import declaration, motion, recorded, sizes
+from lmdsl.advice import declaration, jumps, motion, recorded, sizes
 from lmdsl.advice.report import CheckReport, Finding
 from lmdsl.advice.survey import MOST_SETS, Survey
 from lmdsl.common import inputs
@@ -75,4 +75,4 @@ def _of_the_map(survey: Survey, share: float | None, deadline: Deadline) -> Iter
     yield from motion.few_substeps(survey, deadline)
     yield from motion.on_edges(survey)
     yield from motion.short_step(survey, share, deadline)
-    yield from motion.long_step(survey, share)
+    yield from jumps.long_step(survey, share, deadline)

@@ -8,22 +8,18 @@ import numpy as np
 
 from lmdsl.advice.report import Finding
 from lmdsl.advice.survey import Survey
-from lmdsl.common.types import Bools, Floats, Indices
+from lmdsl.common.types import Indices
 from lmdsl.control.accuracy import TOO_MUCH, integration_error
 from lmdsl.explanation import remedies
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.substeps import needed
-from lmdsl.model.grid.partition import MAX_CELLS, Partition
+from lmdsl.model.grid.partition import MAX_CELLS
 
 STUCK = 0.05  # share of cells tried that keep their samples from which on a step is too short
 COVERED = 0.9  # share of the cells stabilized from which on no longer step is looked for
 WIDE = 2.0  # widths of a cell from which on the median sample moves far enough
 CURED = 0.1  # the part of that share that a remedy may leave
 EDGES = 0.1  # share of images on edges from which on that is no accident
-OVER = 0.9  # share of the samples on the way into A that jump over it, from which on a step is long
-JUMP = 0.25  # share of an axis above which a median move is no motion that has a way
-MOST_NEAR = 256  # number of cells beside A that are tried
-MOST_PLACES = 32  # number of places on the way of a sample
 
 
 def short_step(survey: Survey, share: float | None, deadline: Deadline) -> Iterator[Finding]:
@@ -200,94 +196,3 @@ def _off_edges(survey: Survey, axis: int) -> tuple[int, float] | None:
         if share <= CURED * float(survey.on_edge[axis]):
             return cells, share
     return None
-
-
-def long_step(survey: Survey, share: float | None) -> Iterator[Finding]:
-    """Find that samples beside A jump over it, where too little can be stabilized or is known.
-
-    Nothing where the whole path is judged.
-    """
-    if share is not None and share >= COVERED:
-        return
-    if survey.sets is None or survey.problem.judged == "path" or not len(survey.cells):
-        return
-    p, attractor = survey.partition, survey.sets.attractor
-    if float(np.median(survey.moved)) * float((p.width / survey.span).min()) > JUMP:
-        return
-    cells = _beside(p, attractor, survey.sets.free)
-    if not len(cells):
-        return
-    landed, over, far = _ways(survey, cells, attractor)
-    if over == 0 or over < OVER * (landed + over):
-        return
-    text = (
-        f"of the samples beside A whose way leads into it, {100 * over / (landed + over):.3g} % "
-        f"jump over it; the median sample there moves {far:.2g} widths of A"
-    )
-    figures: dict[str, Any] = {"landing": landed, "jumping": over, "widths_of_attractor": far}
-    if remedies.longer_step(survey.problem, 1) is not None:
-        remedy = 'write "judged": "path" in system, so that a step that enters A on the way counts'
-        yield Finding("long_step", "system.step", text, remedy, figures)
-        return
-    remedy = f"make attractor {max(int(np.ceil(far)), 2)} times as wide, or let next be less time"
-    yield Finding("long_step", "attractor", text, remedy, figures)
-
-
-def _beside(p: Partition, attractor: Bools, free: Indices) -> Indices:
-    """Return free cells beside attractor cells, at most so many."""
-    random = np.random.default_rng(0)
-    inside = np.flatnonzero(attractor)
-    if len(inside) > MOST_NEAR:
-        inside = np.sort(random.choice(inside, MOST_NEAR, replace=False))
-    index = np.stack(p.multi_index(inside), axis=-1)
-    found = []
-    for k in range(p.dimension):
-        for side in (-1, 1):
-            at = index.copy()
-            at[:, k] += side
-            if p.periodic[k]:
-                at[:, k] %= p.cells[k]
-            good = (at[:, k] >= 0) & (at[:, k] < p.cells[k])
-            found.append(np.ravel_multi_index(tuple(at[good].T), p.shape))
-    near = np.intersect1d(np.concatenate(found), free)
-    if len(near) > MOST_NEAR:
-        near = np.sort(random.choice(near, MOST_NEAR, replace=False))
-    return near
-
-
-def _ways(survey: Survey, cells: Indices, attractor: Bools) -> tuple[int, int, float]:
-    """Return how many samples land in A, how many jump over it, and their median move.
-
-    The way of a sample is the straight line to its image; the move is in widths of A.
-    """
-    p = survey.partition
-    index = np.stack(p.multi_index(np.flatnonzero(attractor)), axis=-1)
-    widths = p.width * [_longest_run(np.unique(column)) for column in index.T]
-    landed = over = 0
-    moves = []
-    for begin in range(0, len(cells), max(1, survey.most_cells // MOST_PLACES)):
-        some = cells[begin : begin + max(1, survey.most_cells // MOST_PLACES)]
-        start = survey.start(some)
-        images = survey.images(start, survey.vectors())
-        shape = survey.shape(some)
-        far: Floats = np.zeros(shape)
-        for x, image, width in zip(start, images, widths, strict=True):
-            np.fmax(far, np.abs(image - x) / width, out=far)
-        moves.append(np.median(far, axis=(1, 2, 3)))
-        on_way = np.zeros(shape, dtype=np.bool_)
-        for part in np.arange(1, MOST_PLACES + 1) / MOST_PLACES:
-            at = [x + part * (image - x) for x, image in zip(start, images, strict=True)]
-            flat = np.broadcast_to(p.locate(at), shape)
-            inside = (flat >= 0) & attractor[flat]
-            if part == 1:
-                landed += int(inside.sum())
-                over += int((on_way & ~inside).sum())
-            on_way |= inside
-    return landed, over, float(np.median(np.concatenate(moves)))
-
-
-def _longest_run(values: Indices) -> int:
-    """Return the length of the longest run of consecutive integers."""
-    cuts = np.flatnonzero(np.diff(values) != 1)
-    ends = np.concatenate([[-1], cuts, [len(values) - 1]])
-    return int(np.diff(ends).max())

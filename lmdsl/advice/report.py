@@ -49,11 +49,19 @@ class Expectation(Reported):
         Share of the cells outside attractor and avoid that can be stabilized; None if unknown, or
         if there is no such cell.
     coverage_cells
-        The cells of each axis for which it was computed; the problem's own where that is cheap.
+        The cells of each axis for which it was computed: the problem's own where that is cheap;
+        else it is an estimate.
     memory, available
         Bytes that compiling and solving take, and that are left.
     seconds
         Seconds that compiling takes, roughly.
+    coverage_coarser
+        Of an estimate, the share on the next coarser grid; None if unknown.
+    attractor_widened
+        Whether the attractor was widened to whole cells of that grid, which are larger.
+    coverage_at_most
+        Where the coverage is not known, the share of the cells tried that have a control from which
+        no sample leaves: of the others nothing can be stabilized. None if unknown.
     """
 
     cells: int
@@ -65,6 +73,9 @@ class Expectation(Reported):
     memory: int
     available: int
     seconds: float
+    coverage_coarser: float | None = None
+    attractor_widened: bool = False
+    coverage_at_most: float | None = None
 
     def lines(self, own: dict[str, int]) -> list[str]:
         """Return sentences; ``own`` are the problem's own cells of each axis."""
@@ -75,15 +86,31 @@ class Expectation(Reported):
         if self.coverage is None and self.coverage_cells == own:
             lines.append("coverage: no cell lies outside attractor and avoid")
         elif self.coverage is None:
-            lines.append("coverage: not known without the whole compilation")
+            lines.append(f"coverage: not known without the whole compilation{self._most()}")
+        elif self.coverage_cells == own:
+            lines.append(f"coverage: {100 * self.coverage:.3g} % can be stabilized")
         else:
-            of = "" if self.coverage_cells == own else f" on a grid of {shape(self.coverage_cells)}"
-            lines.append(f"coverage: {100 * self.coverage:.3g} % can be stabilized{of}")
+            lines.append(f"coverage: about {100 * self.coverage:.3g} % can be stabilized, an "
+                         f"estimate on {shape(self.coverage_cells)}{self._beside()}")  # fmt: skip
         lines.append(
             f"memory: about {memory.human(self.memory)} of {memory.human(self.available)}; "
             f"compiling takes about {_seconds(self.seconds)}"
         )
         return lines
+
+    def _most(self) -> str:
+        if self.coverage_at_most is None:
+            return ""
+        share = 100 * self.coverage_at_most
+        return f"; about {share:.3g} % at most: in the other cells tried a sample leaves always"
+
+    def _beside(self) -> str:
+        parts = []
+        if self.attractor_widened:
+            parts.append("with the attractor widened to whole cells there")
+        if self.coverage_coarser is not None:
+            parts.append(f"{100 * self.coverage_coarser:.3g} % on fewer still")
+        return f" ({'; '.join(parts)})" if parts else ""
 
 
 def shape(cells: dict[str, int] | None) -> str:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lmdsl.advice.report import Expectation, Finding, shape
-from lmdsl.advice.survey import Survey
+from lmdsl.advice.survey import MOST_SETS, Survey
 from lmdsl.errors import BadInput
 from lmdsl.explanation import remedies
 from lmdsl.explanation.remedies import StabilizableShare
@@ -20,6 +20,7 @@ from lmdsl.model import discretization, stabilizable_set
 from lmdsl.model.assembly import estimates
 from lmdsl.model.assembly.sampler import Block, Sampler
 from lmdsl.model.assembly.transitions import Assembler, assemble, shares_of
+from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.grid.boxes import Ends
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
@@ -27,7 +28,8 @@ from lmdsl.problem.problem import Problem
 
 # Additions above which compiling is no survey: on the problem's own cells, and on others.
 OWN_WORK, WORK = 6e9, 1e9
-ALIKE = 0.1  # difference of the shares on two grids up to which the finer says what finer ones give
+TELLING = 50  # number of free cells below which coarser cells say nothing about a problem's own
+TRIED = 30  # number of cells below which those tried say nothing about the others
 FUNCTION = 1e5  # additions for which a sample of a map counts of which nobody knows
 # Number of samples that are compiled to tell the time: of formulas, and of a user's own function.
 MOST_SAMPLES, FEW_SAMPLES = 2**20, 2**12
@@ -43,6 +45,7 @@ class Level(NamedTuple):
     cells: dict[str, int]
     found: StabilizableShare
     seconds: float
+    widened: bool = False  # the attractor was, to whole cells
 
 
 def work(problem: Problem) -> float:
@@ -71,37 +74,70 @@ def levels(problem: Problem, deadline: Deadline) -> list[Level]:
             name: max(round(axis.cells * 2.0**power), 1) for name, axis in bare.state_box.items()
         }
         own = power == 0
-        if not own and (problem.attractor.cells or max(cells.values()) > 2**30):
+        other = bare if own else _without_indices(bare)
+        if other is None or max(cells.values()) > 2**30:
             continue
-        scaled = bare if own else remedies.with_cells(bare, cells)
+        scaled = bare if own else remedies.with_cells(other, cells)
         if work(scaled) > (OWN_WORK if own else WORK):
             continue
         if not memory.fits(estimates.estimate(scaled)):
             continue
-        start = time.perf_counter()
         try:
-            covered = remedies.coverage(scaled, deadline)
+            found.insert(0, _compiled(scaled, cells, deadline))
         except BadInput:
             if own:  # a fault of the problem itself: its cost, say
                 raise
-            if power < 0:  # a box of the attractor that holds no cell of this size
+            wider = _widened(scaled) if power < 0 else None
+            if wider is None:
+                continue
+            try:  # a box of the attractor that holds no cell of this size
+                found.insert(0, _compiled(wider, cells, deadline)._replace(widened=True))
+            except BadInput:
                 break
-            continue
-        found.insert(0, Level(scaled, cells, covered, time.perf_counter() - start))
         if len(found) == 3 or (len(found) == 2 and power < 0):
             break
     return found
+
+
+def _compiled(problem: Problem, cells: dict[str, int], deadline: Deadline) -> Level:
+    start = time.perf_counter()
+    covered = remedies.coverage(problem, deadline)
+    return Level(problem, cells, covered, time.perf_counter() - start)
+
+
+def _without_indices(problem: Problem) -> Problem | None:
+    """Return a problem whose attractor is not of indices of cells; None where it is too large."""
+    if not problem.attractor.cells:
+        return problem
+    if math.prod(axis.cells for axis in problem.state_box.values()) > MOST_SETS:
+        return None
+    return problem.replaced(attractor={"boxes": remedies.attractor_boxes(problem)})
+
+
+def _widened(problem: Problem) -> Problem | None:
+    """Return a problem with the boxes of its attractor widened to whole cells; None without any."""
+    boxes = []
+    for box in problem.attractor.boxes:
+        wide = {}
+        for name, (a, b) in box.items():
+            axis = problem.state_box[name]
+            width = (axis.high - axis.low) / axis.cells
+            first = min(max(math.floor((a - axis.low) / width + EDGE), 0), axis.cells - 1)
+            last = min(max(math.ceil((b - axis.low) / width - EDGE), first + 1), axis.cells)
+            wide[name] = (axis.low + first * width, axis.low + last * width)
+        boxes.append(wide)
+    return problem.replaced(attractor={"boxes": boxes}) if boxes else None
 
 
 def expected(survey: Survey, known: list[Level]) -> Expectation:
     """Return what compiling takes and gives."""
     problem, p = survey.problem, survey.partition
     own = {name: axis.cells for name, axis in problem.state_box.items()}
-    few, each = estimates.Pilot(), 0.0
+    few, each, most = estimates.Pilot(), 0.0, None
     if survey.sets is not None and len(survey.sets.free):
         sampler = Sampler(problem, p, sets=survey.sets)
-        few, each = _few(sampler, survey, survey.sets)
-    level = _telling(known, own)
+        few, each, most = _few(sampler, survey, survey.sets)
+    level, coarser = _telling(known, own)
     return Expectation(
         cells=p.size,
         controls=discretization.control_count(problem),
@@ -112,6 +148,9 @@ def expected(survey: Survey, known: list[Level]) -> Expectation:
         memory=estimates.estimate(problem, few),
         available=memory.available().bytes,
         seconds=each * p.size * discretization.control_count(problem),
+        coverage_coarser=None if coarser is None else coarser.found.share,
+        attractor_widened=level is not None and level.widened,
+        coverage_at_most=most if level is None else None,
     )
 
 
@@ -137,8 +176,17 @@ def of_matrices(problem: Problem, deadline: Deadline) -> tuple[Level, Expectatio
     )
 
 
-def _few(sampler: Sampler, survey: Survey, sets: CellSets) -> tuple[estimates.Pilot, float]:
-    """Compile a few cells, and refuse a cost that compiling all would; return seconds a pair."""
+def _few(
+    sampler: Sampler, survey: Survey, sets: CellSets
+) -> tuple[estimates.Pilot, float, float | None]:
+    """Compile a few cells, and refuse a cost that compiling all would.
+
+    Returns
+    -------
+    few, seconds, most
+        What the pairs are like, seconds a pair takes, and which share of the cells has a pair that
+        is admissible; None if too few were tried, or with some of the controls only.
+    """
     shares = shares_of(survey.problem, len(sampler.points), sampler.nodes)
     assembler, blocks = Assembler(sampler, sets, shares), _blocks(sampler, survey)
     assembler(blocks[0])  # kernels are compiled
@@ -149,7 +197,10 @@ def _few(sampler: Sampler, survey: Survey, sets: CellSets) -> tuple[estimates.Pi
     kept, entries = (sum(len(part) for part in parts) for parts in
                      ([row.control for row in rows], [row.target for row in rows]))  # fmt: skip
     few = estimates.Pilot(kept / tried, entries / kept if kept else 1.0)
-    return few, seconds / tried / threads.count()
+    open_cells = np.concatenate([row.per_cell > 0 for row in rows])
+    whole = all(block.width == len(sampler.controls) for block in blocks)
+    most = float(open_cells.mean()) if whole and len(open_cells) >= TRIED else None
+    return few, seconds / tried / threads.count(), most
 
 
 def _blocks(sampler: Sampler, survey: Survey) -> list[Block]:
@@ -166,14 +217,14 @@ def _blocks(sampler: Sampler, survey: Survey) -> list[Block]:
     ]
 
 
-def _telling(known: list[Level], own: dict[str, int]) -> Level | None:
-    """Return the level whose share is that of the problem, about; None if none is."""
+def _telling(known: list[Level], own: dict[str, int]) -> tuple[Level | None, Level | None]:
+    """Return the problem's own level; else the finest, an estimate, and the next coarser one."""
     for level in known:
         if level.cells == own:
-            return level
-    if len(known) > 1 and abs(known[-1].found.share - known[-2].found.share) <= ALIKE:
-        return known[-1]
-    return None
+            return level, None
+    telling = [level for level in known if level.found.free >= TELLING]
+    coarser, finest = [None, None, *telling][-2:]
+    return finest, coarser
 
 
 def too_large(found: Expectation) -> Iterator[Finding]:
