@@ -12,6 +12,8 @@ from scipy.stats import binomtest
 
 Array = NDArray[np.float64]
 FINE = 64  # places of a step at which its path is looked at
+SURE = 0.99  # level of the intervals that must overlap
+EVENTS = ("reached", "outside", "avoid", "no_control")
 
 
 def flow(derivative: Callable[[Array, Array], Array], step: float) -> Callable[..., Array]:
@@ -28,19 +30,26 @@ def flow(derivative: Callable[[Array, Array], Array], step: float) -> Callable[.
     return path
 
 
+def first(places: Array) -> Array:
+    """Return the first place on the way where something holds; far beyond the last where none."""
+    return np.where(places.any(axis=0), places.argmax(axis=0), 10**9)
+
+
 def runs(
     result,
     path: Callable[..., Array],
     reached: Callable[[Array], Array],
     unsafe: Callable[[Array], Array] = lambda x: np.zeros(x.shape[1:], bool),
-    starts: int = 1000,
+    starts: int = 4000,
     steps: int = 1000,
-    seed: int = 0,
-) -> dict[str, float]:
+    seed: int = 1,
+) -> dict[str, int]:
     """Simulate from random places of the stabilizable cells; count what became of the runs.
 
     ``path(x, u, rng)`` returns where the runs are on the way, shape (places, states, runs), the
-    last one the next state; ``reached`` and ``unsafe`` judge places of shape (states, ...).
+    last one the next state; ``reached`` and ``unsafe`` judge places of shape (states, ...). A run
+    ends where it first reaches the target, leaves the box (``outside``), touches what is ``unsafe``
+    (``avoid``), or comes to a cell without control (``no_control``).
     """
     rng = np.random.default_rng(seed)
     axes = list(result.problem.state_box.values())
@@ -51,12 +60,12 @@ def runs(
     chosen = rng.choice(np.flatnonzero(result.cell_status == 1), starts)
     index = np.array(np.unravel_index(chosen, cells.ravel()))
     x = low + (index + rng.random(index.shape)) * width
-    arrived = lost = touched = 0
+    found = {"starts": starts, **dict.fromkeys(EVENTS, 0)}
     for _ in range(steps):
         index = np.floor((x - low) / width + 1e-9).astype(int)
         index = np.where(circle, index % cells, np.minimum(index, cells - 1))
         control = result.control_index[np.ravel_multi_index(tuple(index), cells.ravel())]
-        lost += np.count_nonzero(control < 0)
+        found["no_control"] += np.count_nonzero(control < 0)
         x, control = x[:, control >= 0], control[control >= 0]
         if not x.shape[1]:
             break
@@ -65,30 +74,33 @@ def runs(
         place = np.where(circle[..., None], low[..., None] + (place - low[..., None])
                          % (high - low)[..., None], place)  # fmt: skip
         outside = ~((place >= low[..., None]) & (place <= high[..., None])).all(axis=0)
-        bad, good = outside | unsafe(place), reached(place)
-        never = len(way)
-        first_bad = np.where(bad.any(axis=0), bad.argmax(axis=0), never)
-        first_good = np.where(good.any(axis=0), good.argmax(axis=0), never)
-        ended = np.minimum(first_bad, first_good) < never
-        arrived += np.count_nonzero(ended & (first_good < first_bad))
-        lost += np.count_nonzero(ended & (first_good >= first_bad))
-        harm = unsafe(place)
-        first_harm = np.where(harm.any(axis=0), harm.argmax(axis=0), never)
-        touched += np.count_nonzero((first_harm < never) & (first_harm == first_bad)
-                                    & (first_harm < first_good))  # fmt: skip
+        events = {"outside": outside, "avoid": unsafe(place) & ~outside, "reached": reached(place)}
+        when = {name: first(places) for name, places in events.items()}
+        earliest = np.minimum.reduce(list(when.values()))
+        ended = earliest < len(way)
+        for name in events:  # where two fall together the worse one counts
+            now = ended & (when[name] == earliest)
+            found[name] += np.count_nonzero(now)
+            earliest[now] = -1
         x = place[:, -1, ~ended]
-    return {"starts": starts, "reached": arrived, "lost": lost, "touched": touched}
+    found["safe"] = starts - found["outside"] - found["avoid"]
+    return found
 
 
-def beside(name: str, result, truth: dict[str, float], simulation) -> None:
-    """Print the two side by side, and stop where they disagree."""
+def beside(name: str, result, truth: dict[str, int], simulation) -> None:
+    """Print success and safety side by side, and stop where they disagree."""
+    ours = {"starts": simulation.starts, "reached": simulation.reached, **simulation.lost_to}
+    ours["safe"] = ours["starts"] - ours["outside"] - ours["avoid"]
     print(f"{name}: {result.message}")
-    for key in ("reached", "lost"):
-        ours, theirs = getattr(simulation, key), truth[key]
-        a = binomtest(ours, simulation.starts).proportion_ci(0.9999)
-        b = binomtest(theirs, truth["starts"]).proportion_ci(0.9999)
-        print(
-            f"  {key:8} by lmdsl {100 * ours / simulation.starts:6.2f} %   "
-            f"by SciPy alone {100 * theirs / truth['starts']:6.2f} %"
-        )
-        assert max(a.low, b.low) <= min(a.high, b.high), f"{key}: {a} and {b}"
+    print(f"{'':24}{'by lmdsl':>28}{'by SciPy alone':>28}")
+    words = {"reached": "arrive", "safe": "are never unsafe", "outside": "leave the box",
+             "avoid": "touch what is avoided", "no_control": "lose their control"}  # fmt: skip
+    for key, word in words.items():
+        line, ends = f"  {word:22}", []
+        for who in (ours, truth):
+            share = who[key] / who["starts"]
+            sure = binomtest(who[key], who["starts"]).proportion_ci(SURE)
+            line += f"{100 * share:10.2f} % ({100 * sure.low:5.2f}..{100 * sure.high:6.2f})"
+            ends.append(sure)
+        print(line)
+        assert max(e.low for e in ends) <= min(e.high for e in ends), f"{name}, {word}: {ends}"

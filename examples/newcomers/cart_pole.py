@@ -1,6 +1,8 @@
 """Cart and pole in four dimensions: catch the falling pole, keep the cart on its rail.
 
-Twelve cells an axis are few: nine of ten runs arrive, and both ways of asking say so.
+In four dimensions cells are large. Sampled inside alone (12 x 12 x 12 x 14 cells, 2 an axis), a
+quarter of the box is verified, but one run in ten leaves by the faces of cells that no sample saw.
+With the corners sampled as well a twentieth of the box is left, from which the runs do arrive.
 
 Run:  python cart_pole.py
 """
@@ -28,18 +30,18 @@ problem = lm.Problem(
     },
     state_box={
         "place": {"low": -2.4, "high": 2.4, "cells": 12},
-        "speed": {"low": -3, "high": 3, "cells": 12},
+        "speed": {"low": -3, "high": 3, "cells": 24},
         "angle": {"low": -0.3, "high": 0.3, "cells": 12},
-        "rate": {"low": -2.1, "high": 2.1, "cells": 14},
+        "rate": {"low": -2.1, "high": 2.1, "cells": 24},
     },
     attractor={
         "boxes": [
-            {"place": [-1.2, 1.2], "speed": [-1, 1], "angle": [-0.1, 0.1], "rate": [-0.6, 0.6]}
+            {"place": [-1.2, 1.2], "speed": [-1, 1], "angle": [-0.1, 0.1], "rate": [-0.525, 0.525]}
         ]
     },
-    control_grid={"u": {"low": -10, "high": 10, "points": 7}},
+    control_grid={"u": {"low": -10, "high": 10, "points": 11}},
     stage_cost="1 + 0.01*u**2",
-    sampling={"kind": "grid", "per_axis": 2},
+    sampling={"kind": "grid", "per_axis": 1, "corners": True},
 )
 
 
@@ -54,14 +56,16 @@ def derivative(x, u):
 
 def reached(x):
     """Whether a place lies in the attractor."""
-    ends = np.array([1.2, 1, 0.1, 0.6]).reshape(4, *[1] * (x.ndim - 1))
+    ends = np.array([1.2, 1, 0.1, 0.525]).reshape(4, *[1] * (x.ndim - 1))
     return (np.abs(x) <= ends).all(axis=0)
 
 
 result = lm.solve(problem)
+truth = runs(result, flow(derivative, 0.1), reached)
+assert truth["reached"] >= 0.99 * truth["starts"]
 beside(
     "Cart and pole",
     result,
-    runs(result, flow(derivative, 0.1), reached),
-    result.simulate(1000, 1000),
+    truth,
+    result.simulate(4000, 1000),
 )

@@ -39,4 +39,4 @@ def reached(x):
 
 
 result = lm.solve(problem)
-beside("Duffing", result, runs(result, flow(derivative, 0.3), reached), result.simulate(1000, 1000))
+beside("Duffing", result, runs(result, flow(derivative, 0.3), reached), result.simulate(4000, 1000))

@@ -40,4 +40,4 @@ def derivative(x, u):
 
 result = lm.solve(problem)
 truth = runs(result, flow(derivative, 4.0), lambda x: x[0] <= 0.33, lambda x: x[1] > 0.1)
-beside("Epidemic", result, truth, result.simulate(1000, 1000))
+beside("Epidemic", result, truth, result.simulate(4000, 1000))

@@ -33,4 +33,4 @@ def reached(x):
 
 
 result = lm.solve(problem)
-beside("Inventory", result, runs(result, path, reached), result.simulate(1000, 1000))
+beside("Inventory", result, runs(result, path, reached), result.simulate(4000, 1000))

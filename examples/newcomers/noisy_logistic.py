@@ -35,4 +35,4 @@ def reached(x):
     return (x[0] >= inside.min()) & (x[0] <= inside.max() + 1 / 400)
 
 
-beside("Noisy logistic map", result, runs(result, path, reached), result.simulate(1000, 1000))
+beside("Noisy logistic map", result, runs(result, path, reached), result.simulate(4000, 1000))

@@ -3,18 +3,19 @@
 Between impacts the motion is a piece of a sine; how many impacts fall into a step, and when, is
 found by a loop. The answer is checked by SciPy's integrator, which shares no code with the model.
 
-Run:  python scalar_black_box.py
+Run:  python black_box.py
 """
 
 import math
 
 import numpy as np
+from _truth import beside, runs
 from scipy.integrate import solve_ivp
-from scipy.stats import binomtest
 
 import lmdsl as lm
 
 WALL, RESTITUTION, STEP = -0.6, 0.8, 0.6
+PLACES = 16  # of a step, at which its way is looked at
 
 
 def impact(x, v, u):
@@ -38,21 +39,45 @@ def impact(x, v, u):
 
 
 def impact_by_scipy(x, v, u):
-    """The same by an integrator that looks for the impacts itself."""
+    """The way by an integrator that looks for the impacts itself: PLACES states, the last the next."""
 
     def wall(t, s):
         return s[0] - WALL
 
     wall.terminal, wall.direction = True, -1
-    t, state = 0.0, [max(x, WALL), v]
+    t, state, when = 0.0, [max(x, WALL), v], np.linspace(0, STEP, PLACES + 1)[1:]
+    way = np.empty((PLACES, 2))
     while t < STEP:
-        flow = solve_ivp(
-            lambda t, s: [s[1], u - s[0]], (t, STEP), state, events=wall, rtol=1e-8, atol=1e-10
-        )
-        t, state = flow.t[-1], [*flow.y[:, -1]]
-        if flow.status == 1:
+        leg = solve_ivp(
+            lambda t, s: [s[1], u - s[0]], (t, STEP), state, events=wall,
+            rtol=1e-8, atol=1e-10, dense_output=True,
+        )  # fmt: skip
+        now = (when > t) & (when <= leg.t[-1])
+        if now.any():
+            way[now] = leg.sol(when[now]).T
+        t, state = leg.t[-1], [*leg.y[:, -1]]
+        if leg.status == 1:
             state = [WALL + 1e-12, -RESTITUTION * state[1]]
-    return state
+    way[-1] = state
+    way[:, 0] = np.maximum(way[:, 0], WALL)  # on the wall up to rounding
+    return way
+
+
+def path(x, u, rng):
+    """The ways of all runs."""
+    each = [impact_by_scipy(*run) for run in zip(*x, u[0], strict=True)]
+    return np.moveaxis(np.array(each), 0, 2)
+
+
+def ends(x, u, rng):
+    """Where the runs are after a step: a map has no in-between."""
+    ways.append(path(x, u, rng))
+    return ways[-1][-1:]
+
+
+def reached(x):
+    """Whether a place lies in the attractor."""
+    return (np.abs(x) <= 0.15).all(axis=0)
 
 
 problem = lm.Problem(
@@ -69,31 +94,11 @@ problem = lm.Problem(
 )
 
 
-def arrives(result, start, steps=200):
-    """Return whether the true motion enters the attractor under the controller."""
-    state = start
-    for _ in range(steps):
-        if max(map(abs, state)) <= 0.15:
-            return True
-        u = result.controller(state)[0]
-        if not np.isfinite(u):
-            return False
-        state = impact_by_scipy(*state, u)
-    return False
-
-
-if __name__ == "__main__":
-    result = lm.solve(problem)
-    print(f"{result.status}: {result.message}")
-    run = result.simulate(starts=2000, steps=200)
-    low, high = run.interval
-    print(f"lmdsl: {run.reached / run.starts:.1%} arrive ({low:.1%} to {high:.1%})")
-
-    rng, starts = np.random.default_rng(1), []
-    while len(starts) < 200:  # uniform on the stabilized cells
-        start = rng.uniform([WALL, -1.2], [1.2, 1.2])
-        if np.isfinite(result.controller(start)).all():
-            starts.append(start)
-    true = sum(arrives(result, start) for start in starts)
-    sure = binomtest(true, len(starts)).proportion_ci(0.95)
-    print(f"SciPy: {true / len(starts):.1%} arrive ({sure.low:.1%} to {sure.high:.1%})")
+result = lm.solve(problem)
+ways = []
+truth = runs(result, ends, reached, starts=500, steps=200)
+beside("Mass on a spring with a wall", result, truth, result.simulate(4000, 200))
+fast = sum(np.count_nonzero((np.abs(way[:, 1]) > 1.2).any(axis=0)) for way in ways)
+print(
+    f"on the way, of which a map says nothing: {fast} steps of {truth['starts']} runs leave the box"
+)
