@@ -39,7 +39,7 @@ def impact(x, v, u):
 
 
 def impact_by_scipy(x, v, u):
-    """The way by an integrator that looks for the impacts itself: PLACES states, the last the next."""
+    """The way by an integrator that looks for the impacts itself; its last place is the next."""
 
     def wall(t, s):
         return s[0] - WALL

@@ -64,8 +64,8 @@ result = lm.solve(problem)
 truth = runs(result, ends, reached, starts=4000)
 beside("recorded pendulum", result, truth, result.simulate(4000, 1000))
 way = runs(result, path, reached)
-print(f"on the way, of which nothing was recorded: {100 * way['safe'] / way['starts']:.2f} % are never "
-      f"unsafe, {100 * way['reached'] / way['starts']:.2f} % arrive, by SciPy alone")  # fmt: skip
+safe, there = (100 * way[key] / way["starts"] for key in ("safe", "reached"))
+print(f"on the way, which was not recorded: {safe:.2f} % are never unsafe, {there:.2f} % arrive")
 print(result.data)
 mean, (low, high) = sum(steps) / 4000, result.data.cost
 print(f"mean number of steps by SciPy alone {mean:.3f}, by the recorded rows {result.cost:.3f}")
