@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,8 +37,15 @@ def test_shipped_problems_look_right(name):
     assert not lm.check(lm.load(f"examples/{name}.json"))
 
 
+LARGER = ["double_integrator", "lorenz", "pendulum_on_cart"]
+
+
+def test_every_shipped_problem_is_looked_at():
+    assert {path.stem for path in Path("examples").glob("*.json")} == {*SHIPPED, *LARGER}
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["lorenz", "pendulum_on_cart"])
+@pytest.mark.parametrize("name", LARGER)
 def test_larger_shipped_problems_look_right(name):
     assert not lm.check(lm.load(f"examples/{name}.json"))
 
