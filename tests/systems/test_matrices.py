@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import pickle
 import re
@@ -182,7 +183,7 @@ def test_costs_of_states_pairs_and_transitions():
     ([[0.5, 0.5], [0, 1]], [1, 2], {"targets": [0.5]}, "targets: [0.5] are no states"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"targets": ()}, "targets: no target"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"avoid": [1]},
-     "avoid: cell [1] (state in [0.5, 1.5]) is both attractor and avoid"),
+     "avoid: state 1 is both attractor and avoid"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"maximise": True}, "gamma: 1.0 times the discount"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"layout": "rows"}, "layout: 'rows' is unknown"),
     ([[0.5, 0.5], [0, 1]], [1, 2], {"discount": 1}, "discount"),
@@ -307,3 +308,18 @@ def test_the_best_of_all_policies():
             rewards.append(np.linalg.solve(np.eye(2) - b * rows[:2, :2], earned))
         np.testing.assert_allclose(cost.value, np.min(costs, axis=0), rtol=1e-9)
         np.testing.assert_allclose(reward.rewards[:2], np.max(rewards, axis=0), rtol=1e-9)
+
+
+def test_states_are_called_by_their_numbers():
+    P = np.zeros((1, 6, 6))
+    P[0, :3, 0] = P[0, 3, 2] = P[0, 4, 4] = P[0, 5, 5] = 1
+    problem = lm.from_matrices(P, np.ones(6), [0])
+    found = lm.explain(problem)
+    assert "2 in state 4 to 5" in str(found)
+    assert "state in [" not in str(found)
+    assert found.why(5).text().startswith("state 5: trapped")
+    assert "[3.5, 5.5]" in json.dumps(found.to_dict())
+    with pytest.raises(lm.BadInput, match=r"the density is -2\.0 in state 0; it must be finite"):
+        lm.compile(problem.replaced(measure={"density": "state - 2"}))
+    other = problem.replaced(state_box={"x": {"low": 0, "high": 6, "cells": 6}})
+    assert "x in [4, 6]" in str(lm.explain(other))

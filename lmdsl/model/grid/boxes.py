@@ -6,6 +6,7 @@ left, so every box holds cells of the set only and no cell is counted twice. A p
 per cell and axis. On a periodic axis boxes grow across the seam.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -18,6 +19,10 @@ from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.grid.partition import Partition
 
 Ends = dict[str, tuple[float, float]]
+
+
+class Numbered(Ends):
+    """The ends of cells of a finite model, which are called by number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +105,9 @@ class Area(Frozen):
 
 def shown(box: Ends) -> str:
     """Return a box as text, such as "x in [0, 1], y in [2, 3]"."""
+    if isinstance(box, Numbered):
+        first = {name: (math.ceil(a), math.floor(b)) for name, (a, b) in box.items()}
+        return ", ".join(f"{x} {a}" if a == b else f"{x} {a} to {b}" for x, (a, b) in first.items())
     return ", ".join(f"{name} in [{a + 0.0:.6g}, {b + 0.0:.6g}]" for name, (a, b) in box.items())
 
 
@@ -124,7 +132,7 @@ def regions(partition: Partition, mask: Bools, limit: int) -> tuple[Region, ...]
 
 def ends(partition: Partition, first: Indices, count: Indices) -> Ends:
     """Return the ends of ``count`` cells from ``first`` on every axis."""
-    box = {}
+    box: Ends = Numbered() if partition.numbered else {}
     for k, name in enumerate(partition.names):
         a, n = int(first[k]), int(count[k])
         low, high, width = (float(v[k]) for v in (partition.low, partition.high, partition.width))
@@ -146,6 +154,8 @@ def of_cell(partition: Partition, cell: int) -> Ends:
 
 def named(partition: Partition, cell: int) -> str:
     """Return a cell by its index on every axis and its ends, for a message."""
+    if partition.numbered:
+        return shown(of_cell(partition, cell))
     index = [int(i) for i in np.unravel_index(cell, partition.shape)]
     return f"cell {index} ({shown(of_cell(partition, cell))})"
 

@@ -20,6 +20,7 @@ from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.forking import cached_property
 from lmdsl.model.grid.axis import EDGE, AxisCells
+from lmdsl.problem.consistency import endings
 from lmdsl.problem.problem import Problem
 
 MAX_CELLS = 2**31 - 2  # number of cells above which indices of 32 bits do not suffice
@@ -41,6 +42,8 @@ class Partition(Frozen):
         Which axes are circles, shape (d,).
     clip
         True when finite images are saturated into the box on non-periodic axes.
+    numbered
+        True for a finite model: its cells are called by number.
     """
 
     names: tuple[str, ...]
@@ -50,6 +53,7 @@ class Partition(Frozen):
     cells: Indices
     periodic: Bools
     clip: bool = False
+    numbered: bool = False
 
     @classmethod
     def of(cls, problem: Problem) -> Self:
@@ -57,12 +61,9 @@ class Partition(Frozen):
         axes = problem.state_box.values()
         size = math.prod(axis.cells for axis in axes)
         if size > MAX_CELLS:
-            raise BadInput(
-                f"{size:.3g} cells do not fit in memory (limit {MAX_CELLS:.3g}); use fewer cells",
-                "state_box",
-            )
-        low = np.array([axis.low for axis in axes])
-        high = np.array([axis.high for axis in axes])
+            fault = f"{size:.3g} cells do not fit in memory (limit {MAX_CELLS:.3g})"
+            raise BadInput(f"{fault}; use fewer cells", "state_box")
+        low, high = np.array([(axis.low, axis.high) for axis in axes]).T.copy()
         cells = np.array([axis.cells for axis in axes], dtype=np.int64)
         return cls(
             names=problem.states,
@@ -72,6 +73,7 @@ class Partition(Frozen):
             cells=cells,
             periodic=np.array([axis.periodic for axis in axes]),
             clip=problem.on_exit == "clip",
+            numbered=endings.numbered(problem),
         )
 
     @property

@@ -16,6 +16,15 @@ def rate(problem: "Problem") -> Fraction:
     return Fraction(problem.gamma) * Fraction(1 if problem.discount is None else problem.discount)
 
 
+def numbered(problem: "Problem") -> bool:
+    """Return whether states are the numbers of cells: those of a finite model, as it is given."""
+    whole = all(
+        axis.low == -0.5 and axis.high == axis.cells - 0.5 for axis in problem.state_box.values()
+    )
+    system = problem.system
+    return whole and isinstance(system, MatrixSystem) and not isinstance(system, DataSystem)
+
+
 def require_end(problem: "Problem") -> None:
     """Refuse a problem with nothing to reach, unless its runs end by discount."""
     if not problem.attractor.empty:
