@@ -149,7 +149,7 @@ class Why(Frozen):
 
     def text(self) -> str:
         """Return all facts, a line each."""
-        own = f"cell {list(self.index)}, " * (not isinstance(self.box, boxes.Numbered))
+        own = f"cell {list(self.index)}, " * (not isinstance(self.box, boxes.ByNumber))
         lines = [f"{own}{boxes.shown(self.box)}: {self.cause}"]
         lines += [f"  {move}" for move in self.moves] or [f"  {self.first}"]
         lines += [f"  trap: {_count(r.cells, 'cell')}, {r}" for r in self.trap]

@@ -21,7 +21,7 @@ from lmdsl.model.grid.partition import Partition
 Ends = dict[str, tuple[float, float]]
 
 
-class Numbered(Ends):
+class ByNumber(Ends):
     """The ends of cells of a finite model, which are called by number."""
 
 
@@ -105,7 +105,7 @@ class Area(Frozen):
 
 def shown(box: Ends) -> str:
     """Return a box as text, such as "x in [0, 1], y in [2, 3]"."""
-    if isinstance(box, Numbered):
+    if isinstance(box, ByNumber):
         first = {name: (math.ceil(a), math.floor(b)) for name, (a, b) in box.items()}
         return ", ".join(f"{x} {a}" if a == b else f"{x} {a} to {b}" for x, (a, b) in first.items())
     return ", ".join(f"{name} in [{a + 0.0:.6g}, {b + 0.0:.6g}]" for name, (a, b) in box.items())
@@ -132,7 +132,7 @@ def regions(partition: Partition, mask: Bools, limit: int) -> tuple[Region, ...]
 
 def ends(partition: Partition, first: Indices, count: Indices) -> Ends:
     """Return the ends of ``count`` cells from ``first`` on every axis."""
-    box: Ends = Numbered() if partition.numbered else {}
+    box: Ends = ByNumber() if partition.numbered else {}
     for k, name in enumerate(partition.names):
         a, n = int(first[k]), int(count[k])
         low, high, width = (float(v[k]) for v in (partition.low, partition.high, partition.width))
