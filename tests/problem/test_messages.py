@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+from random import Random
+
 import pytest
 from problems import made, steps
 
@@ -202,3 +205,46 @@ def test_formulas_of_a_problem_in_python_are_judged_too():
 def test_a_file_of_many_wrong_formulas_takes_no_time():
     text = said(gamma=-1, attractor={"where": ["x <"] * 100_000}, let={"a": "x +" * 1_000})
     assert len(text) < 10_000
+
+
+WRONG = [
+    None, -1, 1.5, True, "x", "x^2", "", [], {}, [1], {"x": 1}, {"x": "x^"}, {"kind": "map"},
+    {"kind": [1]}, {"kind": "standard_map", "parameters": []}, {"next": {"x": 3}}, ["x < 1", 2],
+    {"where": 3}, {"where": ["a", None]}, object(), {1: 2}, {"parameters": {"K": "x"}}, b"x",
+    {"x": {"low": 0, "high": 1, "cells": 2}},
+]  # fmt: skip
+
+
+def _places(data, path=()):
+    yield path
+    if isinstance(data, dict | list):
+        for key in data if isinstance(data, dict) else range(len(data)):
+            yield from _places(data[key], (*path, key))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whatever_is_wrong_is_one_message(seed):
+    """Parts replaced, added and taken out: bad input or a problem, never another error."""
+    random = Random(seed)
+    whole = {**steps(), "let": {"a": "x + u"}, "noise": {"w": {"values": [0], "weights": [1]}},
+             "measure": {"density": "x"}, "avoid": {"where": ["x > 2"]}, "admissible": "u < 3",
+             "terminal_cost": "x"}  # fmt: skip
+    said_of = []
+    for _ in range(400):
+        data = copy.deepcopy(whole)
+        for _ in range(random.randint(1, 4)):
+            *path, last = random.choice([path for path in _places(data) if path] or [("name",)])
+            at = data
+            for key in path:
+                at = at[key]
+            if random.random() < 0.6:
+                at[last] = copy.deepcopy(random.choice(WRONG))
+            elif isinstance(at, dict):
+                at.pop(last, None)
+                at[random.choice(["zz", "states", "a b", "sin", "judged", 3])] = 1
+        try:
+            made(data)
+        except lm.BadInput as error:
+            said_of.append(str(error))
+    assert len(said_of) > 200
+    assert not [text for text in said_of if "\n" in text]

@@ -168,10 +168,11 @@ def _known(problem: Any, keys: Collection[str]) -> tuple[Declarations, bool]:
         part = _part(problem, key)
         sure &= isinstance(part, Mapping) or (kind == "noise" and part is None)
         kinds[kind] = tuple(part) if isinstance(part, Mapping) else ()
-    let = _part(problem, "let")
-    sure &= let is None or len(_table(let)) == len(let)
-    names = itertools.chain(*kinds.values(), constants, let or ())
-    return Declarations(kinds, tuple(constants)), sure and all(map(_sound, names))
+    let = {} if (part := _part(problem, "let")) is None else part
+    sure &= isinstance(let, Mapping) and len(_table(let)) == len(let)
+    names = itertools.chain(*kinds.values(), constants, _table(let))
+    sure &= all(map(_sound, names))
+    return Declarations({k: _words(v) for k, v in kinds.items()}, _words(constants)), sure
 
 
 def _constants(data: Mapping[str, Any], keys: Collection[str]) -> tuple[bool, Collection[str]]:
@@ -189,6 +190,10 @@ def _constants(data: Mapping[str, Any], keys: Collection[str]) -> tuple[bool, Co
         return sure, own | set(NAMED[kind].defaults)
     model: Any = {"map": MapSystem, "ode": OdeSystem}.get(kind if isinstance(kind, str) else "")
     return sure and model is not None and set(system) <= set(model.model_fields), own
+
+
+def _words(names: Collection[object]) -> tuple[str, ...]:
+    return tuple(name for name in names if isinstance(name, str))
 
 
 def _sound(name: object) -> bool:
