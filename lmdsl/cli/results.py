@@ -1,4 +1,4 @@
-"""What is done with a result directory: ``verify``, ``simulate``, ``plot``, ``export``."""
+"""What is done with a result directory: ``verify``, ``simulate``, ``prove``, ``plot``, ``export``."""
 
 import sys
 from importlib import import_module
@@ -30,6 +30,12 @@ def add(command: Command) -> None:
     simulate.add_argument("--as-compiled", action="store_true",
                           help="follow the compiled steps and noise nodes")  # fmt: skip
     shared(simulate, "--time-limit", "--json")
+
+    prove = command("prove", _prove, "Prove what becomes of C on the true map, by volume.")
+    shared(prove, "dir")
+    prove.add_argument("--target", type=float, default=0.999, metavar="T",
+                       help="share that is to arrive (default 0.999)")  # fmt: skip
+    shared(prove, "--time-limit", "--json")
 
     plot = command("plot", _plot, "Draw the figures of a saved result.")
     shared(plot, "dir")
@@ -70,6 +76,18 @@ def _simulate(parsed: Arguments) -> int:
         return 0
     say(f"{runs.text()}\n({AS_STORED})")
     return 0
+
+
+def _prove(parsed: Arguments) -> int:
+    from lmdsl.results.directory import proved
+    from lmdsl.results.result import Result
+
+    result = Result.load(parsed.dir)
+    with ProgressLine() as progress:
+        proof = result.prove(parsed.target, parsed.time_limit, progress=progress)
+    proved.add(parsed.dir, result, proof)
+    answer(parsed, proof)
+    return 0 if proof.reached else 1
 
 
 def _plot(parsed: Arguments) -> int:

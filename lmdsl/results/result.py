@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from lmdsl.certificate import sums
 from lmdsl.certificate.claims import Certificate
 from lmdsl.common import inputs
-from lmdsl.common.records import Reported, freeze
-from lmdsl.common.types import Bools, Floats, Statuses
+from lmdsl.common.records import freeze
+from lmdsl.common.types import Bools, Floats, Progress, Statuses
 from lmdsl.control.controller import Controller
 from lmdsl.control.loop import ClosedLoop
 from lmdsl.control.simulation import Simulation, simulate
@@ -29,7 +29,7 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.results.status import Cause, Status
-from lmdsl.results.summary import Coverage, Summary
+from lmdsl.results.summary import CostFrom, Coverage, Summary
 from lmdsl.systems import MatrixSystem
 from lmdsl.systems.named import NotStored
 
@@ -37,28 +37,9 @@ if TYPE_CHECKING:
     import os
 
     from lmdsl.model.lp import StabilizationLP
+    from lmdsl.proof.record import Proof
 
 ARRAYS = ("control_index", "value", "lower", "measure", "cell_status")
-
-
-@dataclass(frozen=True)
-class CostFrom(Reported):
-    """The conditional cost of a starting region.
-
-    Attributes
-    ----------
-    upper, lower
-        The policy's cost is at most ``upper``; no policy costs less than ``lower``.
-    mass
-        Share m(B) of the weight that starts there.
-    """
-
-    upper: float
-    lower: float
-    mass: float
-
-    def __str__(self) -> str:
-        return f"cost between {self.lower:.9g} and {self.upper:.9g} from {self.mass:.4g} of m"
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
@@ -284,6 +265,34 @@ class Result(Summary):
         compiled = inputs.flag(as_compiled, "as_compiled")
         loop = self.closed_loop.compiled if compiled else self.closed_loop
         return simulate(loop, cells, weight, starts, steps, seed, hold, deadline)
+
+    @own_arithmetic
+    def prove(
+        self,
+        target: float = 0.999,
+        time_limit: float | None = None,
+        *,
+        progress: Progress | None = None,
+    ) -> Proof:
+        """Prove what becomes of C under the controller: of the true map, by volume.
+
+        Parameters
+        ----------
+        target
+            Share of the volume of C that is to be proved to arrive.
+        time_limit
+            Seconds after which what is proved so far is the answer.
+        progress
+            Called with (stage, fraction done).
+
+        Raises
+        ------
+        BadInput
+            The system is no formula, or there is no controller.
+        """
+        from lmdsl.results.proofs import prove
+
+        return prove(self, target, time_limit, progress)
 
     @own_arithmetic
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -17,6 +17,26 @@ from lmdsl.results.status import Status
 
 
 @dataclass(frozen=True)
+class CostFrom(Reported):
+    """The conditional cost of a starting region.
+
+    Attributes
+    ----------
+    upper, lower
+        The policy's cost is at most ``upper``; no policy costs less than ``lower``.
+    mass
+        Share m(B) of the weight that starts there.
+    """
+
+    upper: float
+    lower: float
+    mass: float
+
+    def __str__(self) -> str:
+        return f"cost between {self.lower:.9g} and {self.upper:.9g} from {self.mass:.4g} of m"
+
+
+@dataclass(frozen=True)
 class Seconds:
     """Wall-clock seconds of the three stages."""
 

@@ -117,6 +117,7 @@ def _certificate(result: Result) -> dict[str, Any]:
         "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
         "versions": versions(),
         "scope": scope(result.problem),
+        "proof": None,  # of another save
     }
     return {
         key: jsonable(apart[key] if key in apart else getattr(result, key))

@@ -56,6 +56,22 @@ def _record(kind: type[Any]) -> BeforeValidator:
     return BeforeValidator(read)
 
 
+class ProofKeys(_Keys):
+    """What is said of a proof of the true map; the boxes that prove it are in proof.npz."""
+
+    arrives: float
+    lost: float
+    stays: float
+    undecided: float
+    steps: int | None
+    cost: Annotated[tuple[Bound, Bound] | None, BeforeValidator(plain)]
+    boxes: Annotated[int, Field(ge=0, lt=2**31)]
+    seconds: float
+    holds: bool | None
+    target: float
+    sha256: str = ""
+
+
 class CertificateFile(_Keys):
     """What certificate.json says; keys that came later have a default, others are ignored."""
 
@@ -93,6 +109,7 @@ class CertificateFile(_Keys):
     model_sha256: str
     versions: dict[str, str] = Field(default_factory=dict)
     scope: str = System.scope
+    proof: ProofKeys | None = None
 
     @classmethod
     def read(cls, data: dict[str, Any]) -> Self:

@@ -1,0 +1,205 @@
+"""The cover: boxes in a tree below every cell, their images, and what is known of them.
+
+Nodes 0 to N - 1 are the cells; those of C are bisected where it helps, the others are what they
+are. A node is the part ``place`` of 2^``split`` equal parts of its cell, by axis. The outer faces
+of a cell include the margin in which states may lie that are located in it; the first cell of a
+circle has states at both ends of the axis, and so have its first boxes.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Floats, Indices, Statuses
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.proof.search import ARRIVES, LOST, UNDECIDED
+
+DEEPEST = 30  # bisections of an axis
+
+
+class Tree(NamedTuple):
+    """Arrays by node, the first ``count`` of which are in use.
+
+    Attributes
+    ----------
+    cell, parent, child
+        Cell, node above (-1: none) and first of the two nodes below (-1: a leaf).
+    axis
+        Along which it is or would be bisected.
+    split, place
+        Shape (nodes, d): see the module.
+    state, flags
+        What is known of it; what its images may do besides meeting cells (places.py).
+    level, cost, least
+        Steps to the attractor, or to the loss; bounds of the cost from there.
+    dearest, cheapest
+        Bounds of the stage cost on it.
+    first, images
+        Position of its images in the store, and their number.
+    waits, waiting, following
+        Undecided leaf that it waits for (-1: none); first of those that wait for it, and the next
+        of those that wait for the same.
+    """
+
+    cell: NDArray[np.int32]
+    parent: NDArray[np.int32]
+    child: NDArray[np.int32]
+    axis: NDArray[np.int8]
+    split: NDArray[np.uint8]
+    place: NDArray[np.uint32]
+    state: NDArray[np.uint8]
+    flags: NDArray[np.uint8]
+    level: NDArray[np.int32]
+    cost: Floats
+    least: Floats
+    dearest: Floats
+    cheapest: Floats
+    first: NDArray[np.int64]
+    images: NDArray[np.int32]
+    waits: NDArray[np.int32]
+    waiting: NDArray[np.int32]
+    following: NDArray[np.int32]
+
+
+_KINDS = {
+    "cell": "i4", "parent": "i4", "child": "i4", "axis": "i1", "split": "u1", "place": "u4",
+    "state": "u1", "flags": "u1", "level": "i4", "cost": "f8", "least": "f8", "dearest": "f8",
+    "cheapest": "f8", "first": "i8", "images": "i4", "waits": "i4", "waiting": "i4",
+    "following": "i4",
+}  # fmt: skip
+_NONE = ("parent", "child", "waits", "waiting", "following")
+
+
+def node_bytes(d: int, images: int) -> int:
+    """Return the bytes of a node with so many images."""
+    return 85 + 5 * d + 16 * d * images
+
+
+class Cover:
+    """The nodes of a proof.
+
+    Attributes
+    ----------
+    partition
+        The cells.
+    tree, places
+        The nodes, and the places of their images, shape (images, d, 2).
+    count, used
+        Number of nodes and of images.
+    """
+
+    def __init__(self, partition: Partition, status: Statuses) -> None:
+        self.partition, N, d = partition, partition.size, partition.dimension
+        self.tree = self._empty(max(2 * N, 1024))
+        self.places = np.zeros((max(N, 1024), d, 2), dtype=np.int64)
+        self.count, self.used = N, 0
+        tree = self.tree
+        tree.cell[:N] = np.arange(N)
+        state = np.full(N, LOST, dtype=np.uint8)
+        state[status == CellStatus.ATTRACTOR] = ARRIVES
+        state[status == CellStatus.STABILIZED] = UNDECIDED
+        tree.state[:N] = state
+
+    def _empty(self, size: int) -> Tree:
+        d = self.partition.dimension
+        arrays = {}
+        for name, kind in _KINDS.items():
+            shape = (size, d) if name in ("split", "place") else (size,)
+            arrays[name] = np.full(shape, -1 if name in _NONE else 0, dtype=kind)
+        return Tree(**arrays)
+
+    def leaves(self, nodes: Indices | slice | None = None) -> Indices:
+        """Return the nodes that are not bisected."""
+        return np.flatnonzero(self.tree.child[: self.count] < 0)
+
+    def volume(self, nodes: Indices) -> Floats:
+        """Return volumes of nodes, in cells."""
+        return np.asarray(2.0 ** -self.tree.split[nodes].sum(axis=1, dtype=np.float64))
+
+    def grow(self, more: int) -> None:
+        """Make room for nodes."""
+        if self.count + more > len(self.tree.cell):
+            size = max(self.count + more, len(self.tree.cell) * 3 // 2)
+            larger = self._empty(size)
+            for old, new in zip(self.tree, larger, strict=True):
+                new[: self.count] = old[: self.count]
+            self.tree = larger
+
+    def bisect(self, nodes: Indices) -> Indices:
+        """Bisect leaves along their axes; return the new nodes."""
+        self.grow(2 * len(nodes))
+        tree, first = self.tree, self.count + 2 * np.arange(len(nodes))
+        tree.child[nodes] = first
+        axis = tree.axis[nodes]
+        for half in (0, 1):
+            new = first + half
+            for name in ("cell", "split", "place", "flags", "axis"):
+                getattr(tree, name)[new] = getattr(tree, name)[nodes]
+            tree.parent[new] = nodes
+            tree.split[new, axis] += 1
+            tree.place[new, axis] = 2 * tree.place[new, axis] + half
+            tree.state[new] = UNDECIDED
+        self.count += 2 * len(nodes)
+        return np.arange(self.count - 2 * len(nodes), self.count)
+
+    def keep(self, count: Indices) -> Indices:
+        """Make room for images; return the position of the first of each."""
+        first = self.used + np.concatenate([[0], np.cumsum(count)])
+        total = int(first[-1])
+        if total > len(self.places):
+            larger = np.zeros((max(total, len(self.places) * 3 // 2), *self.places.shape[1:]),
+                              dtype=np.int64)  # fmt: skip
+            larger[: self.used] = self.places[: self.used]
+            self.places = larger
+        self.used = total
+        return np.asarray(first[:-1])
+
+
+class Pieces(NamedTuple):
+    """The boxes of nodes: one each, and more where a node lies at both ends of a circle.
+
+    Attributes
+    ----------
+    owner
+        Position of the node of each box.
+    low, high
+        Ends, shape (B, d).
+    start
+        Cells before the modulus, shape (B, d).
+    """
+
+    owner: Indices
+    low: Floats
+    high: Floats
+    start: Floats
+
+
+def pieces(partition: Partition, cell: Indices, split: Indices, place: Indices) -> Pieces:
+    """Return the boxes of nodes, which hold all states that lie in them, ends rounded outward."""
+    index = np.stack(partition.multi_index(cell), axis=-1).astype(np.float64)
+    part = 2.0 ** -split.astype(np.float64)
+    first, last = index + place * part, index + (place + 1.0) * part
+    margin = np.array([axis.margin for axis in partition.axes])
+    at_first, at_last = place == 0, place + 1.0 == 2.0**split
+    first = np.where(at_first, first - margin, first)
+    last = np.where(at_last, last + margin, last)
+    owner, start = np.arange(len(index)), index
+    for k in np.flatnonzero(partition.periodic):
+        seam = np.flatnonzero(at_first[owner, k] & (index[owner, k] == 0))
+        first, last, owner, start = (
+            np.concatenate([ends, ends[seam]]) for ends in (first, last, owner, start)
+        )
+        beyond, n = slice(len(owner) - len(seam), None), float(partition.cells[k])
+        first[beyond, k], last[beyond, k], start[beyond, k] = n - margin[k], n + margin[k], n
+    low, high = _down(first * partition.width), _up(last * partition.width)
+    return Pieces(owner, _down(partition.low + low), _up(partition.low + high), start)
+
+
+def _down(x: Floats) -> Floats:
+    return np.asarray(x - (np.abs(x) * 2.0**-52 + 2.0**-1000))
+
+
+def _up(x: Floats) -> Floats:
+    return np.asarray(x + (np.abs(x) * 2.0**-52 + 2.0**-1000))

@@ -1,0 +1,272 @@
+"""Enclosing images, paths and costs on many boxes: tapes run block by block.
+
+The image of a box lies in N and in M + [-e, e] (enclosures.py): the natural interval, and the mean
+value form about the centre with a bound of what rounding adds.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lmdsl.common.types import Floats
+from lmdsl.formulas.compiled.ends import down, up
+from lmdsl.formulas.compiled.machine import BLOCK, registers, run
+from lmdsl.machine.kernels import kernel
+from lmdsl.proof.tapes import Step, Tapes
+
+HERMITE = 2.0**-46  # relative error of a computed point of an arc, generously
+
+
+class Given(NamedTuple):
+    """Boxes and what acts on them: ends of states (B, d), controls (B, p), noise (B, r)."""
+
+    low: Floats
+    high: Floats
+    control: Floats
+    least: Floats
+    most: Floats
+
+
+class Found(NamedTuple):
+    """What is enclosed.
+
+    Attributes
+    ----------
+    low, high
+        Ends of all components of the image, shape (B, m).
+    stretch
+        How far a side of the box moves each component of the image, shape (B, m, d).
+    arcs
+        Ends of what holds each arc of the path, shape (B, arcs, d, 2).
+    way
+        Ends of what holds the ways from the start to the control points of the first arc, and of
+        what holds the way to its end, shape (B, d, 4). Where the first do not hold 0, the arc
+        leaves the start in one direction.
+    """
+
+    low: Floats
+    high: Floats
+    stretch: Floats
+    arcs: Floats
+    way: Floats
+
+
+class Rows(NamedTuple):
+    """Registers of the tapes of a step, and the sides of boxes about their centres."""
+
+    box: Floats
+    centre: Floats
+    end_box: Floats
+    end_centre: Floats
+    away: Floats
+
+
+def rows(step: Step) -> Rows:
+    """Return registers for a step; threads need their own."""
+    return Rows(
+        registers(step.advance.box), registers(step.advance.centre), registers(step.end.box),
+        registers(step.end.centre), np.zeros((step.sizes[0], 2, BLOCK)),
+    )  # fmt: skip
+
+
+def enclose(step: Step, given: Given, held: Rows | None = None) -> Found:
+    """Enclose the step on boxes."""
+    count, d, m = len(given.low), step.sizes[0], step.sizes[1]
+    arcs = step.substeps if step.path else 0
+    found = Found(
+        np.empty((count, m)), np.empty((count, m)), np.empty((count, m, d)),
+        np.empty((count, arcs, d, 2)), np.empty((count, d if step.path else 0, 4)),
+    )  # fmt: skip
+    with np.errstate(all="ignore"):
+        _enclose(step, given, rows(step) if held is None else held, found)
+    return found
+
+
+def ranges(step: Step, tapes: Tapes, given: Given) -> tuple[Floats, Floats]:
+    """Enclose numbers that depend on states, controls and noise, shape (B, outputs) each."""
+    shape = (len(given.low), len(tapes.middle))
+    low, high, stretch = np.empty(shape), np.empty(shape), np.empty((*shape, step.sizes[0]))
+    if shape[1]:
+        sides = np.zeros((step.sizes[0], 2, BLOCK))
+        box, centre = registers(tapes.box), registers(tapes.centre)
+        _ranges(tapes, given, step.sizes, (box, centre, sides), (low, high, stretch))
+    return low, high
+
+
+@kernel
+def _load(rows, first, given, sizes, at, seed):  # type: ignore[no-untyped-def]
+    """Put the boxes from ``at`` on into registers, components and their slopes at the start."""
+    d, m, p, r = sizes
+    for i in range(BLOCK):
+        b = min(at + i, len(given.low) - 1)
+        for k in range(d):
+            rows[k, 0, i], rows[k, 1, i] = given.low[b, k], given.high[b, k]
+        for j in range(p):
+            rows[first + j, 0, i] = rows[first + j, 1, i] = given.control[b, j]
+        for j in range(r):
+            rows[first + p + j, 0, i] = given.least[b, j]
+            rows[first + p + j, 1, i] = given.most[b, j]
+        if seed:
+            for j in range(d, m):
+                rows[j, 0, i] = rows[j, 1, i] = 0.0
+            for j in range(m * (d + 1)):
+                x = 1.0 if (j < m * d) & (j % d == j // d) else 0.0
+                rows[m + j, 0, i] = rows[m + j, 1, i] = x
+
+
+@kernel
+def _centre(rows, away, given, d, at):  # type: ignore[no-untyped-def]
+    """Put centres in place of boxes, and fill in the sides about them."""
+    for i in range(BLOCK):
+        b = min(at + i, len(given.low) - 1)
+        for k in range(d):
+            low, high = given.low[b, k], given.high[b, k]
+            c = min(max(0.5 * low + 0.5 * high, low), high)
+            rows[k, 0, i] = rows[k, 1, i] = c
+            away[k, 0, i], away[k, 1, i] = down(low - c), up(high - c)
+
+
+@kernel
+def mean_value(rows, out, middle, away, i):  # type: ignore[no-untyped-def]
+    """Return what contains all values computed of an output on box i of the block."""
+    value, error = out[0], rows[out[1], 1, i]
+    low, high = down(middle[0, i] - error), up(middle[1, i] + error)
+    for k in range(len(away)):
+        a, b = rows[out[2 + k], 0, i], rows[out[2 + k], 1, i]
+        x, y = away[k, 0, i], away[k, 1, i]
+        p, q, r, s = a * x, a * y, b * x, b * y
+        low = down(low + down(min(min(p, q), min(r, s))))
+        high = up(high + up(max(max(p, q), max(r, s))))
+    if not high - low < np.inf:
+        return rows[value, 0, i], rows[value, 1, i]
+    return max(low, rows[value, 0, i]), min(high, rows[value, 1, i])
+
+
+@kernel
+def _extend(arcs, b, s, k, low, high, fresh):  # type: ignore[no-untyped-def]
+    """Make an arc hold a control point too."""
+    arcs[b, s, k, 0] = low if fresh else min(arcs[b, s, k, 0], low)
+    arcs[b, s, k, 1] = high if fresh else max(arcs[b, s, k, 1], high)
+
+
+@kernel
+def _points(arcs, tapes, held, at, s, row):  # type: ignore[no-untyped-def]
+    """Extend arc s by the control points that are outputs from ``row`` on."""
+    rows, middle, away = held
+    d = len(away)
+    for i in range(min(BLOCK, len(arcs) - at)):
+        for k in range(d):
+            out = tapes.out[row + k]
+            low, high = mean_value(rows, out, middle[tapes.middle[row + k]], away, i)
+            _extend(arcs, at + i, s, k, low, high, False)
+
+
+@kernel
+def _ways(way, tapes, box, at, row, kind):  # type: ignore[no-untyped-def]
+    """Note the ways from the start to control points, outputs from ``row`` on.
+
+    ``kind`` 0: to the first, m/3; 1: to the last, b - a; 2: what the last but one lacks of that.
+    """
+    d = way.shape[1]
+    for i in range(min(BLOCK, len(way) - at)):
+        for k in range(d):
+            low, high = box[tapes.out[row + k, 0], 0, i], box[tapes.out[row + k, 0], 1, i]
+            w = way[at + i, k]
+            if kind == 0:
+                w[0], w[1] = low, high
+            else:
+                if kind == 1:
+                    w[2], w[3] = low, high
+                else:
+                    low, high = down(w[2] - high), up(w[3] - low)
+                w[0], w[1] = min(w[0], low), max(w[1], high)
+
+
+@kernel
+def _start(arcs, given, at, s):  # type: ignore[no-untyped-def]
+    """Begin the first arc at the box."""
+    for i in range(min(BLOCK, len(arcs) - at)):
+        for k in range(arcs.shape[2]):
+            _extend(arcs, at + i, s, k, given.low[at + i, k], given.high[at + i, k], True)
+
+
+@kernel
+def _knot(found, step, held, at, s):  # type: ignore[no-untyped-def]
+    """Note the end of substep s: of the arc before it and, where there is one, the next."""
+    rows, middle, away = held
+    tapes, d = step.advance, len(away)
+    for i in range(min(BLOCK, len(found.low) - at)):
+        for k in range(len(found.low[0])):
+            out = tapes.out[k]
+            low, high = mean_value(rows, out, middle[tapes.middle[k]], away, i)
+            found.low[at + i, k], found.high[at + i, k] = low, high
+            for j in range(d):
+                a, b = rows[out[2 + j], 0, i], rows[out[2 + j], 1, i]
+                found.stretch[at + i, k, j] = max(abs(a), abs(b)) * (away[j, 1, i] - away[j, 0, i])
+            if step.path & (k < d):
+                _extend(found.arcs, at + i, s, k, low, high, False)
+                if s + 1 < step.substeps:
+                    _extend(found.arcs, at + i, s + 1, k, low, high, True)
+
+
+@kernel
+def _pass(source, target, count):  # type: ignore[no-untyped-def]
+    """Copy the first registers."""
+    for j in range(count):
+        for i in range(BLOCK):
+            target[j, 0, i], target[j, 1, i] = source[j, 0, i], source[j, 1, i]
+
+
+@kernel
+def _enclose(step, given, held, found):  # type: ignore[no-untyped-def]
+    d, m, p, r = step.sizes
+    first = m * (2 + d)
+    work = (held.box, held.centre, held.away)
+    for at in range(0, len(given.low), BLOCK):
+        _load(held.box, first, given, step.sizes, at, True)
+        _load(held.centre, first, given, step.sizes, at, True)
+        _centre(held.centre, held.away, given, d, at)
+        if step.path:
+            _start(found.arcs, given, at, 0)
+        for s in range(step.substeps):
+            run(step.advance.box, held.box)
+            run(step.advance.centre, held.centre)
+            if step.path:
+                _points(found.arcs, step.advance, work, at, s, m)
+                if s == 0:
+                    _ways(found.way, step.advance, held.box, at, m + 2 * d, 0)
+                    _ways(found.way, step.advance, held.box, at, m + 3 * d, 1)
+                else:
+                    _points(found.arcs, step.advance, work, at, s - 1, m + d)
+                if s == 1:
+                    _ways(found.way, step.advance, held.box, at, m + 2 * d, 2)
+            _knot(found, step, work, at, s)
+        if step.path:
+            _pass(held.box, held.end_box, first + p + r)
+            _pass(held.centre, held.end_centre, first + p + r)
+            run(step.end.box, held.end_box)
+            run(step.end.centre, held.end_centre)
+            last = (held.end_box, held.end_centre, held.away)
+            _points(found.arcs, step.end, last, at, step.substeps - 1, 0)
+            if step.substeps == 1:
+                _ways(found.way, step.end, held.end_box, at, d, 2)
+
+
+@kernel
+def _ranges(tapes, given, sizes, work, found):  # type: ignore[no-untyped-def]
+    box, centre, away = work
+    low, high, stretch = found
+    d, m = sizes[0], sizes[0]
+    plain = (d, m, sizes[2], sizes[3])
+    for at in range(0, len(low), BLOCK):
+        _load(box, m * (2 + d), given, plain, at, False)
+        _load(centre, m * (2 + d), given, plain, at, False)
+        _centre(centre, away, given, d, at)
+        run(tapes.box, box)
+        run(tapes.centre, centre)
+        for i in range(min(BLOCK, len(low) - at)):
+            for k in range(low.shape[1]):
+                found_low, found_high = mean_value(
+                    box, tapes.out[k], centre[tapes.middle[k]], away, i
+                )
+                low[at + i, k], high[at + i, k] = found_low, found_high

@@ -1,0 +1,177 @@
+"""What a proof says: shares of the volume of C, bounds, and the boxes that carry it."""
+
+import hashlib
+import math
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.records import Frozen, jsonable
+from lmdsl.common.types import Floats
+from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
+
+TARGET = 0.999  # share of the volume that is asked for where nothing else is
+
+
+ARRAYS: dict[str, tuple[bool, str]] = {  # by axis too, and the kind
+    "cell": (False, "<i8"), "split": (True, "|u1"), "place": (True, "<u4"), "class": (False, "|u1"),
+    "level": (False, "<i4"), "cost": (False, "<f8"), "lower": (False, "<f8"),
+}  # fmt: skip
+BOX = 40  # bytes of a box but for its axes
+
+
+def expected(boxes: int, axes: int) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Return the shapes and kinds of the arrays of so many boxes."""
+    return {
+        name: ((boxes, axes) if by_axis else (boxes,), kind)
+        for name, (by_axis, kind) in ARRAYS.items()
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Proof(Frozen):
+    """What is proved of the true map under a controller, by volume; see :meth:`Result.prove`.
+
+    Attributes
+    ----------
+    arrives, lost, stays, undecided
+        Shares of the volume of C.
+    steps
+        Within how many steps all that arrives does; None where nothing does.
+    cost
+        Bounds of the average true cost over what arrives, by volume; None where nothing does.
+    boxes
+        Number of boxes.
+    seconds
+        Time it took.
+    holds
+        Whether what is in A stays in A: True where it is proved, False where a run left it, None
+        where neither is known.
+    target
+        The share asked for.
+    cell, split, place
+        The boxes: part ``place`` of 2^``split`` equal parts of a cell, by axis; (B,) and (B, d).
+    kind
+        What becomes of each: 0 undecided, 1 arrives, 2 is lost, 3 stays.
+    level
+        Steps to A, or to the loss; else 0.
+    cost_above, cost_below
+        Bounds of the cost of a run from there (with noise ``cost_below`` of the mean too); 0
+        unless it arrives.
+    """
+
+    arrives: float
+    lost: float
+    stays: float
+    undecided: float
+    steps: int | None
+    cost: tuple[float, float] | None
+    boxes: int
+    seconds: float
+    holds: bool | None
+    target: float
+    cell: NDArray[np.int64]
+    split: NDArray[np.uint8]
+    place: NDArray[np.uint32]
+    kind: NDArray[np.uint8]
+    level: NDArray[np.int32]
+    cost_above: Floats
+    cost_below: Floats
+    to_stay: bool = False
+
+    @classmethod
+    def of(
+        cls, arrays: dict[str, NDArray[Any]], cells: int, *, seconds: float, holds: bool | None,
+        target: float, to_stay: bool,
+    ) -> Self:  # fmt: skip
+        """Return the proof that boxes are; ``cells`` is the number of cells of C."""
+        kind, volume = arrays["class"], volumes(arrays["split"])
+        shares = [
+            math.fsum(volume[kind == k]) / max(cells, 1) for k in (ARRIVES, LOST, STAYS, UNDECIDED)
+        ]
+        arriving = kind == ARRIVES
+        weight = volume[arriving]
+        cost = steps = None
+        if arriving.any():
+            ends = (_mean(arrays[name][arriving], weight) for name in ("lower", "cost"))
+            cost, steps = tuple(ends), int(arrays["level"][arriving].max())
+        return cls(
+            *shares, steps, cost, len(kind), seconds, holds, target, arrays["cell"],
+            arrays["split"], arrays["place"], kind, arrays["level"], arrays["cost"],
+            arrays["lower"], to_stay,
+        )  # fmt: skip
+
+    @property
+    def reached(self) -> bool:
+        """Whether the target is reached: by what arrives, or stays where there is no attractor."""
+        return (self.stays if self.to_stay else self.arrives) >= self.target
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the arrays of proof.npz."""
+        found = (self.cell, self.split, self.place, self.kind, self.level, self.cost_above,
+                 self.cost_below)  # fmt: skip
+        return {
+            name: np.ascontiguousarray(array, dtype=kind)
+            for (name, (_, kind)), array in zip(ARRAYS.items(), found, strict=True)
+        }
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the arrays."""
+        found = hashlib.sha256()
+        for array in self.arrays().values():
+            found.update(array.tobytes())
+        return found.hexdigest()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        names = (
+            "arrives",
+            "lost",
+            "stays",
+            "undecided",
+            "steps",
+            "cost",
+            "boxes",
+            "seconds",
+            "holds",
+        )
+        return {name: jsonable(getattr(self, name)) for name in names}
+
+    def text(self) -> str:
+        """Return what is proved for people."""
+        lines = [
+            f"of the volume of C {_percent(self.arrives)} is proved to arrive, "
+            f"{_percent(self.lost)} to be lost, {_percent(self.stays)} to stay elsewhere; "
+            f"{_percent(self.undecided)} is undecided"
+        ]
+        if self.cost is not None:
+            low, high = self.cost
+            lines.append(
+                f"  what arrives does so in at most {self.steps} steps; its average cost lies "
+                f"between {low:.6g} and {high:.6g}"
+            )
+        held = {True: "proved", False: "refuted by a run", None: "not proved"}[self.holds]
+        lines.append(f"  that what is in A stays there is {held}")
+        lines.append(f"  {self.boxes:,} boxes, {self.seconds:.1f} s; target {self.target:.6g} is "
+                     f"{'reached' if self.reached else 'not reached'}")  # fmt: skip
+        return "\n".join(lines)
+
+    __str__ = text
+
+
+def volumes(split: NDArray[np.uint8]) -> Floats:
+    """Return the volumes of boxes, in cells."""
+    return np.asarray(2.0 ** -split.sum(axis=1, dtype=np.float64))
+
+
+def _mean(x: Floats, weight: Floats) -> float:
+    if not np.isfinite(x).all():
+        return float(np.where(np.isfinite(x), 0.0, x).sum())
+    return math.fsum(x * weight) / math.fsum(weight)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.4f} %"

@@ -1,0 +1,142 @@
+"""What images of boxes meet: the search of the tree, compiled."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Floats
+from lmdsl.machine.kernels import kernel
+from lmdsl.proof.places import BITS, LAST, MAY_ARRIVE, MAY_LEAVE, PARTS
+
+UNDECIDED, ARRIVES, LOST, STAYS = range(4)  # states of nodes
+MEETS_UNDECIDED, MEETS_ARRIVING, MEETS_LOST, MEETS_STAYING = 1, 2, 4, 8  # 1 << state
+ANY, EVERY, LEAVING = range(3)  # what ends a search: an undecided leaf, nothing, leaving a set
+
+
+class Met(NamedTuple):
+    """What a search found.
+
+    ``most`` and ``least`` are bounds of the cost over all that is met and arrives; ``level`` is
+    the largest level of what is met.
+    """
+
+    bits: int
+    leaf: int
+    most: float
+    least: float
+    level: int
+
+
+class Search(NamedTuple):
+    """What a search needs.
+
+    Attributes
+    ----------
+    tree, places
+        The nodes, and the places of their images.
+    cells, stride, periodic
+        Of the axes, shape (d,).
+    entry
+        Bounds of the cost paid where a path enters the attractor: least, most.
+    stack, odometer
+        Room for the search: nodes, and per axis first, last and current cell, and the range of
+        places within it, shape (5, d).
+    mark
+        By node: whether a search that is LEAVING counts an undecided leaf as left, or an inner
+        node as one that has such a leaf.
+    """
+
+    tree: "object"
+    places: NDArray[np.int64]
+    cells: NDArray[np.int64]
+    stride: NDArray[np.int64]
+    entry: Floats
+    stack: NDArray[np.int64]
+    odometer: NDArray[np.int64]
+    mark: NDArray[np.uint8]
+
+
+@kernel
+def meet(search, b, until):  # type: ignore[no-untyped-def]
+    """Return what the images of a node meet; at once, when an undecided leaf is, unless EVERY."""
+    tree = search.tree
+    met = Met(0, -1, -np.inf, np.inf, 0)
+    if tree.flags[b] & MAY_LEAVE:
+        met = Met(MEETS_LOST, -1, -np.inf, np.inf, 0)
+    if tree.flags[b] & MAY_ARRIVE:
+        met = Met(met.bits | MEETS_ARRIVING, -1, search.entry[1], search.entry[0], 0)
+    for j in range(tree.first[b], tree.first[b] + tree.images[b]):
+        image = search.places[j]
+        if image[0, 0] > image[0, 1]:
+            continue  # nothing of it is in the box
+        met = _meet_cells(search, image, until, met)
+        if (met.bits & MEETS_UNDECIDED) and until != EVERY:
+            break
+    return met
+
+
+@kernel
+def _meet_cells(search, image, until, met):  # type: ignore[no-untyped-def]
+    first, last, at, low, high = search.odometer
+    d = len(search.cells)
+    for k in range(d):
+        first[k], last[k] = image[k, 0] >> BITS, image[k, 1] >> BITS
+        at[k] = first[k]
+    while True:
+        root = 0
+        for k in range(d):
+            low[k] = image[k, 0] & LAST if at[k] == first[k] else 0
+            high[k] = image[k, 1] & LAST if at[k] == last[k] else LAST
+            root += (at[k] % search.cells[k]) * search.stride[k]
+        met = _descend(search, root, until, met)
+        if (met.bits & MEETS_UNDECIDED) and until != EVERY:
+            return met
+        k = d - 1
+        while k >= 0:
+            at[k] += 1
+            if at[k] <= last[k]:
+                break
+            at[k] = first[k]
+            k -= 1
+        if k < 0:
+            return met
+
+
+@kernel
+def _descend(search, root, until, met):  # type: ignore[no-untyped-def]
+    """Search below a cell; decided nodes are taken as a whole unless EVERY leaf is asked for."""
+    tree, stack = search.tree, search.stack
+    low, high = search.odometer[3], search.odometer[4]
+    bits, leaf, most, least, level = met
+    stack[0], size = root, 1
+    while size > 0:
+        size -= 1
+        n = stack[size]
+        state, child = tree.state[n], tree.child[n]
+        inner = child >= 0
+        if inner & ((state == UNDECIDED) | (until == EVERY)):
+            if (until == LEAVING) & (search.mark[n] == 0):
+                continue
+            axis = tree.axis[n]
+            middle = np.int64(tree.place[child + 1, axis]) << (BITS - tree.split[child + 1, axis])
+            if low[axis] < middle:
+                stack[size], size = child, size + 1
+            if high[axis] >= middle:
+                stack[size], size = child + 1, size + 1
+            continue
+        if (until == LEAVING) & (state == UNDECIDED) & (search.mark[n] == 0):
+            continue
+        bits |= 1 << state
+        if state == ARRIVES:
+            most, least = max(most, tree.cost[n]), min(least, tree.least[n])
+            level = max(level, tree.level[n])
+        elif state == LOST:
+            level = max(level, tree.level[n])
+        elif state == UNDECIDED:
+            leaf = n
+            if until != EVERY:
+                break
+        if (until == LEAVING) & (bits & (MEETS_ARRIVING | MEETS_LOST) != 0):
+            break
+    return Met(bits, leaf, most, least, level)

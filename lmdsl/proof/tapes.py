@@ -1,0 +1,202 @@
+"""The step of a problem as tapes: what encloses its images, its paths and its cost on boxes.
+
+Registers that are given come first: the values of all components (states, then the integral of a
+cost rate), their slopes in the directions of the states, their errors, the controls, the noise.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.errors import BadInput
+from lmdsl.formulas.compiled.machine import Tape
+from lmdsl.formulas.compiled.tape import ONE, ZERO, Value, Writer
+from lmdsl.formulas.compiled.traced import Traced, trace
+from lmdsl.formulas.program import Program
+from lmdsl.problem.problem import Problem
+from lmdsl.systems.runge_kutta import RungeKutta
+
+Registers = NDArray[np.int64]
+
+
+class Tapes(NamedTuple):
+    """A function on boxes: on the box with slopes, and at its centre.
+
+    Attributes
+    ----------
+    box, centre
+        The tapes.
+    out
+        Registers of ``box``, shape (outputs, 2 + d): value, error, slopes.
+    middle
+        Registers of ``centre``, shape (outputs,).
+    into
+        Number of components that the tapes leave where they found them, for the next substep.
+    """
+
+    box: Tape
+    centre: Tape
+    out: Registers
+    middle: Registers
+    into: int
+
+
+class Step(NamedTuple):
+    """The step of a problem.
+
+    Attributes
+    ----------
+    advance
+        Makes a substep; its outputs are the components, and where a path is judged control points
+        a + m/3 and a - m/3 of the arcs after and before, by state, and m/3 and the way b - a.
+    end
+        Of the last knot a - m/3, and m/3.
+    cost, terminal
+        The stage cost, and the terminal cost in a state; without outputs where there is none.
+    substeps
+        Number of substeps; 1 for a map.
+    path
+        Whether the path is judged.
+    sizes
+        Numbers of states, of components, of controls and of noise variables.
+    """
+
+    advance: Tapes
+    end: Tapes
+    cost: Tapes
+    terminal: Tapes
+    substeps: int
+    path: bool
+    sizes: tuple[int, int, int, int]
+
+
+def step(problem: Problem) -> Step:
+    """Return the step of a problem as tapes.
+
+    BadInput: a part of it is no formula.
+    """
+    if problem.functions:
+        raise BadInput(
+            "a Python function cannot be enclosed; write a formula", problem.functions[0]
+        )
+    flow = problem.flow()
+    advances: Any = problem.step() if flow is None else flow
+    if not isinstance(advances, Program | RungeKutta):
+        raise BadInput("nothing but its rows is known of the system, so that nothing can be proved "
+                       "of what lies between", "system")  # fmt: skip
+    constants = problem.system.constants()
+    stage = [] if problem.cost_rate is not None else [problem.cost()]
+    terminal = problem.terminal()
+    names, states = (problem.controls, problem.noises), problem.states
+    path = problem.judged == "path"
+    if isinstance(advances, Program):
+        make = _Maker(states, names, len(states), seeded=True)
+        advance, end = make.program(advances), make.nothing()
+    else:
+        make = _Maker(states, names, len(states) + advances.integrals, advances.substeps == 1)
+        advance, end = make.substep(advances, path), make.nothing()
+        if path:
+            end = _Maker(states, names, make.components, seeded=False).knot(advances)
+    plain = _Maker(states, names, len(states), seeded=True)
+    return Step(
+        advance, end, plain.program(Program(stage, constants)),
+        plain.program(Program([] if terminal is None else [terminal], constants)),
+        getattr(advances, "substeps", 1), path,
+        (len(states), make.components, len(names[0]), len(names[1])),
+    )  # fmt: skip
+
+
+class _Maker:
+    """Makes tapes of the same registers.
+
+    ``seeded`` says that slopes are those at the start, 1 and 0; they are then no registers.
+    """
+
+    def __init__(
+        self, states: Sequence[str], names: tuple[Sequence[str], ...], components: int, seeded: bool
+    ) -> None:
+        self.states, self.names = states, (*names[0], *names[1])
+        self.components, self.seeded = components, seeded
+
+    def given(self, directions: int) -> tuple[Writer, dict[str, Traced], list[Traced]]:
+        """Return a writer, the jets by name, and those of the components."""
+        d, m = len(self.states), self.components
+        first = m * (2 + d)
+        writer = Writer(first + len(self.names))
+        parts = []
+        for i in range(m):
+            slope: list[Value | None] = [
+                (ONE if i == k else None) if self.seeded else writer.input(m + i * d + k)
+                for k in range(directions)
+            ]
+            error = None if self.seeded else writer.input(m + m * d + i)
+            value = ZERO if self.seeded and i >= d else writer.input(i)
+            parts.append(Traced(writer, value, slope, error if directions else None))
+        named = dict(zip(self.states, parts, strict=False))
+        for j, name in enumerate(self.names):
+            named[name] = Traced(writer, writer.input(first + j), [None] * directions, None)
+        return writer, named, parts
+
+    def nothing(self) -> Tapes:
+        """Return tapes without outputs."""
+        return self.made([], [])
+
+    def program(self, program: Program) -> Tapes:
+        """Return the tapes of formulas."""
+        if not program.formulas:
+            return self.nothing()
+        boxed, centred = (list(trace(program, self.given(n)[1])) for n in (len(self.states), 0))
+        return self.made(boxed, centred)
+
+    def substep(self, flow: RungeKutta, path: bool) -> Tapes:
+        """Return the tapes of a substep of an equation."""
+        boxed, centred = (self._substep(flow, path, n) for n in (len(self.states), 0))
+        return self.made(boxed, centred, self.components)
+
+    def _substep(self, flow: RungeKutta, path: bool, directions: int) -> list[Traced]:
+        _, named, parts = self.given(directions)
+        slopes, end = flow.substep(named, tuple(parts), lambda values: trace(flow.field, values))
+        found, h, d = list(end), flow.h, len(self.states)
+        if path:
+            k1, k2, k3, k4 = slopes
+            thirds = [(h / 3) * k1[i] for i in range(d)]
+            found += [parts[i] + thirds[i] for i in range(d)]
+            found += [parts[i] - thirds[i] for i in range(d)]
+            found += thirds
+            found += [(h / 6) * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]) for i in range(d)]
+        return found
+
+    def knot(self, flow: RungeKutta) -> Tapes:
+        """Return the tapes of the last control point before a knot."""
+
+        def found(directions: int) -> list[Traced]:
+            _, named, parts = self.given(directions)
+            slopes, d = trace(flow.field, named), len(self.states)
+            thirds = [(flow.h / 3) * slopes[i] for i in range(d)]
+            return [*(parts[i] - thirds[i] for i in range(d)), *thirds]
+
+        return self.made(found(len(self.states)), found(0))
+
+    def made(self, boxed: list[Traced], centred: list[Traced], into: int = 0) -> Tapes:
+        """Return finished tapes; the first ``into`` outputs go where the components were."""
+        d, m = len(self.states), self.components
+        writer = boxed[0].writer if boxed else Writer(0)
+        values: list[Value] = []
+        goes: dict[int, Value] = {}
+        for i, jet in enumerate(boxed):
+            slope = [ZERO if p is None else p for p in jet.slope]
+            error = ZERO if jet.error is None else jet.error
+            values += [jet.value, error, *slope]
+            if i < into:
+                goes |= {i: jet.value, m + m * d + i: error}
+                goes |= {m + i * d + k: p for k, p in enumerate(slope)}
+        box, out = writer.finish(values, goes)
+        other = centred[0].writer if centred else Writer(0)
+        goes = {i: jet.value for i, jet in enumerate(centred[:into])}
+        centre, middle = other.finish([jet.value for jet in centred], goes)
+        return Tapes(
+            box, centre, np.array(out, dtype=np.int64).reshape(-1, 2 + d),
+            np.array(middle, dtype=np.int64), into,
+        )  # fmt: skip
