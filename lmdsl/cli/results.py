@@ -1,4 +1,4 @@
-"""What is done with a result directory: ``verify``, ``simulate``, ``prove``, ``plot``, ``export``."""
+"""What is done with a result directory: ``verify``, ``simulate``, ``prove`` and others."""
 
 import sys
 from importlib import import_module

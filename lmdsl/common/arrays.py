@@ -108,4 +108,4 @@ def _member(
         content = file.read(size + 1)
     if len(content) != size:
         raise BadInput(f"ends after {len(content)} of {size} bytes", name)
-    return np.frombuffer(content, dtype=kind).copy()
+    return np.frombuffer(content, dtype=kind).reshape(shape).copy()

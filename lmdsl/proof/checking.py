@@ -110,12 +110,11 @@ def _planted(cover: Cover, arrays: Arrays, place: Indices) -> bool:
 def plant_all(tree, boxes, spans, free, leaf):  # type: ignore[no-untyped-def]
     """Make the nodes below cells, whose boxes stand together; see :func:`plant`."""
     count, room = free
-    for j in range(len(spans[0])):
-        first, last = spans[0][j], spans[1][j]
-        cell = boxes[3][first]
-        count = plant(
-            tree, (boxes[0], boxes[1], boxes[2]), (cell, first, last), (count, room), leaf
-        )
+    order, split, place, cell = boxes
+    begin, end = spans
+    for j in range(len(begin)):
+        span = (cell[begin[j]], begin[j], end[j])
+        count = plant(tree, (order, split, place), span, (count, room), leaf)
         if count < 0:
             return count
     return count
@@ -152,7 +151,7 @@ def plant(tree, boxes, span, free, leaf):  # type: ignore[no-untyped-def]
             leaf[b] = n
             continue
         middle = _parted(order, (split, place), (begin, end), axis, tree.split[n, axis])
-        if middle == begin or middle == end or count + 2 > len(tree.cell):
+        if (middle == begin) | (middle == end) | (count + 2 > len(tree.cell)):
             return -1
         tree.child[n], tree.axis[n] = count, axis
         for half in range(2):

@@ -6,7 +6,7 @@ of a cell include the margin in which states may lie that are located in it; the
 circle has states at both ends of the axis, and so have its first boxes.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,13 +104,13 @@ class Cover:
 
     def _empty(self, size: int) -> Tree:
         d = self.partition.dimension
-        arrays = {}
+        arrays: dict[str, Any] = {}
         for name, kind in _KINDS.items():
             shape = (size, d) if name in ("split", "place") else (size,)
             arrays[name] = np.full(shape, -1 if name in _NONE else 0, dtype=kind)
         return Tree(**arrays)
 
-    def leaves(self, nodes: Indices | slice | None = None) -> Indices:
+    def leaves(self) -> Indices:
         """Return the nodes that are not bisected."""
         return np.flatnonzero(self.tree.child[: self.count] < 0)
 
@@ -123,8 +123,8 @@ class Cover:
         if self.count + more > len(self.tree.cell):
             size = max(self.count + more, len(self.tree.cell) * 3 // 2)
             larger = self._empty(size)
-            for old, new in zip(self.tree, larger, strict=True):
-                new[: self.count] = old[: self.count]
+            for name in _KINDS:
+                getattr(larger, name)[: self.count] = getattr(self.tree, name)[: self.count]
             self.tree = larger
 
     def bisect(self, nodes: Indices) -> Indices:

@@ -85,11 +85,11 @@ def enclose(step: Step, given: Given, held: Rows | None = None) -> Found:
 def ranges(step: Step, tapes: Tapes, given: Given) -> tuple[Floats, Floats]:
     """Enclose numbers that depend on states, controls and noise, shape (B, outputs) each."""
     shape = (len(given.low), len(tapes.middle))
-    low, high, stretch = np.empty(shape), np.empty(shape), np.empty((*shape, step.sizes[0]))
+    low, high = np.empty(shape), np.empty(shape)
     if shape[1]:
         sides = np.zeros((step.sizes[0], 2, BLOCK))
         box, centre = registers(tapes.box), registers(tapes.centre)
-        _ranges(tapes, given, step.sizes, (box, centre, sides), (low, high, stretch))
+        _ranges(tapes, given, step.sizes, (box, centre, sides), (low, high))
     return low, high
 
 
@@ -255,7 +255,7 @@ def _enclose(step, given, held, found):  # type: ignore[no-untyped-def]
 @kernel
 def _ranges(tapes, given, sizes, work, found):  # type: ignore[no-untyped-def]
     box, centre, away = work
-    low, high, stretch = found
+    low, high = found
     d, m = sizes[0], sizes[0]
     plain = (d, m, sizes[2], sizes[3])
     for at in range(0, len(low), BLOCK):

@@ -1,8 +1,9 @@
 """Images of the boxes of a cover: enclosed, located, and kept."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Indices, Statuses
 from lmdsl.machine import threads
@@ -13,6 +14,7 @@ from lmdsl.problem.problem import Problem
 from lmdsl.proof import enclosing, places, tapes
 from lmdsl.proof.cover import DEEPEST, Pieces, pieces
 
+Whole = NDArray[Any]  # whole numbers of any kind
 SOME = 2**13  # boxes enclosed at a time by a thread
 
 
@@ -35,10 +37,10 @@ class Seen(NamedTuple):
 
     owner: Indices
     place: Indices
-    flags: Indices
+    flags: Whole
     dearest: Floats
     cheapest: Floats
-    axis: Indices
+    axis: Whole
 
 
 class Images:
@@ -67,7 +69,7 @@ class Images:
         kind[status == CellStatus.AVOID] = places.MAY_LEAVE
         self.ground = (self.axes, kind, partition.clip, enclosing.HERMITE)
 
-    def __call__(self, cell: Indices, split: Indices, place: Indices) -> Seen:
+    def __call__(self, cell: Whole, split: Whole, place: Whole) -> Seen:
         """Return what is known of the images of nodes; several threads work."""
         starts = range(0, len(cell), SOME)
 
@@ -82,7 +84,7 @@ class Images:
         rest = (np.concatenate(arrays) for arrays in list(zip(*found, strict=True))[1:])
         return Seen(owner, *rest)
 
-    def part(self, cell: Indices, split: Indices, place: Indices) -> Seen:
+    def part(self, cell: Whole, split: Whole, place: Whole) -> Seen:
         """Return the same by this thread; images of a node stand together, nodes in order."""
         boxes = pieces(self.partition, cell, split, place)
         count, nodes, d = len(boxes.owner), len(cell), self.partition.dimension
@@ -92,7 +94,7 @@ class Images:
         for least, most in zip(*self.noise, strict=True):
             given = enclosing.Given(
                 boxes.low, boxes.high, self.control[cell[boxes.owner]],
-                np.broadcast_to(least, (count, len(least))), np.broadcast_to(most, (count, len(most))),
+                *(np.broadcast_to(ends, (count, len(ends))) for ends in (least, most)),
             )  # fmt: skip
             found = enclosing.enclose(self.step, given, held)
             image, more = self._located(boxes, found)
@@ -108,7 +110,7 @@ class Images:
         image = np.concatenate(located)[order]
         return Seen(owner[order], image, flags, dearest, cheapest, axis)
 
-    def _located(self, boxes: Pieces, found: enclosing.Found) -> tuple[Indices, Indices]:
+    def _located(self, boxes: Pieces, found: enclosing.Found) -> tuple[Indices, Whole]:
         d = self.partition.dimension
         image = np.empty((len(found.low), d, 2), dtype=np.int64)
         flags = np.zeros(len(found.low), dtype=np.uint8)
@@ -121,7 +123,7 @@ class Images:
         return image, flags & ~np.uint8(places.EMPTY)
 
     def _cost(
-        self, given: enclosing.Given, found: enclosing.Found, flags: Indices
+        self, given: enclosing.Given, found: enclosing.Found, flags: Whole
     ) -> tuple[Floats, Floats]:
         d = self.partition.dimension
         if found.low.shape[1] > d:  # of a rate, paid only until A is entered
@@ -131,14 +133,14 @@ class Images:
         low, high = enclosing.ranges(self.step, self.step.cost, given)
         return low[:, 0], high[:, 0]
 
-    def _axis(self, stretch: Floats, split: Indices) -> Indices:
+    def _axis(self, stretch: Floats, split: Whole) -> Whole:
         size = 2.0 ** -split.astype(np.float64)
-        sound = np.isfinite(stretch).all(axis=1)
+        sound = np.asarray(np.isfinite(stretch).all(axis=1))
         worth = np.where(sound[:, None], np.maximum(stretch, 1e-3 * size), size)
         worth[split >= DEEPEST] = -1.0
-        return np.argmax(worth, axis=1)
+        return np.asarray(np.argmax(worth, axis=1))
 
 
-def deep(split: Indices) -> Bools:
+def deep(split: Whole) -> Bools:
     """Return which nodes cannot be bisected any more."""
     return np.asarray((split >= DEEPEST).all(axis=-1))

@@ -142,11 +142,11 @@ def crossed(first, last, axes, kind, clip):  # type: ignore[no-untyped-def]
     if not count <= MOST_CROSSED:
         return MAY_LEAVE | MAY_ARRIVE
     for j in range(np.int64(count)):
-        rest, cell = j, 0.0
+        rest, cell = np.int64(j), 0.0
         for k in range(len(axes)):
             size = np.int64(last[k] - first[k] + 1.0)
             at = first[k] + rest % size
-            rest = rest // size
+            rest //= size
             cell += axes[k, 4] * (at - np.floor(at / axes[k, 3]) * axes[k, 3])
         flags |= kind[np.int64(cell)]
     return flags

@@ -96,7 +96,7 @@ class Prover:
     def undecided(self, leaves: Indices) -> Indices:
         """Return which of some leaves are undecided still."""
         tree = self.cover.tree
-        return leaves[(tree.child[leaves] < 0) & (tree.state[leaves] == UNDECIDED)]
+        return np.asarray(leaves[(tree.child[leaves] < 0) & (tree.state[leaves] == UNDECIDED)])
 
     def shares(self) -> Floats:
         """Return the shares of the volume of C by state."""

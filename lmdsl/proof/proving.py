@@ -101,8 +101,8 @@ def boxes(prover: Prover) -> dict[str, NDArray[Any]]:
     tree = cover.tree
     leaves = cover.leaves()
     leaves = leaves[tree.images[leaves] > 0]
-    for state in (ARRIVES, LOST):
-        some = leaves[tree.state[leaves] == state]
+    for decided in (ARRIVES, LOST):
+        some = leaves[tree.state[leaves] == decided]
         some = some[np.argsort(tree.level[some], kind="stable")]
         settling.refine(prover.search, some, prover.factor)
     leaves = leaves[np.argsort(tree.cell[leaves], kind="stable")]

@@ -88,19 +88,19 @@ class Proof(Frozen):
     ) -> Self:  # fmt: skip
         """Return the proof that boxes are; ``cells`` is the number of cells of C."""
         kind, volume = arrays["class"], volumes(arrays["split"])
-        shares = [
-            math.fsum(volume[kind == k]) / max(cells, 1) for k in (ARRIVES, LOST, STAYS, UNDECIDED)
-        ]
+
+        def share(state: int) -> float:
+            return math.fsum(volume[kind == state]) / max(cells, 1)
+
         arriving = kind == ARRIVES
-        weight = volume[arriving]
-        cost = steps = None
+        weight, cost, steps = volume[arriving], None, None
         if arriving.any():
-            ends = (_mean(arrays[name][arriving], weight) for name in ("lower", "cost"))
-            cost, steps = tuple(ends), int(arrays["level"][arriving].max())
+            low, high = (_mean(arrays[name][arriving], weight) for name in ("lower", "cost"))
+            cost, steps = (low, high), int(arrays["level"][arriving].max())
         return cls(
-            *shares, steps, cost, len(kind), seconds, holds, target, arrays["cell"],
-            arrays["split"], arrays["place"], kind, arrays["level"], arrays["cost"],
-            arrays["lower"], to_stay,
+            share(ARRIVES), share(LOST), share(STAYS), share(UNDECIDED), steps, cost, len(kind),
+            seconds, holds, target, arrays["cell"], arrays["split"], arrays["place"], kind,
+            arrays["level"], arrays["cost"], arrays["lower"], to_stay,
         )  # fmt: skip
 
     @property
@@ -118,7 +118,7 @@ class Proof(Frozen):
         }
 
     @property
-    def digest(self) -> str:
+    def sha256(self) -> str:
         """SHA-256 of the arrays."""
         found = hashlib.sha256()
         for array in self.arrays().values():

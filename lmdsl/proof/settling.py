@@ -219,7 +219,7 @@ def _depth(tree, n):  # type: ignore[no-untyped-def]
 
 @kernel
 def refine(search, leaves, factor):  # type: ignore[no-untyped-def]
-    """Work out levels and bounds of decided leaves, by level, from those of the leaves they meet."""
+    """Work out levels and bounds of decided leaves, in order of levels, from those they meet."""
     tree = search.tree
     for j in range(len(leaves)):
         b = leaves[j]

@@ -16,7 +16,7 @@ from lmdsl.formulas.compiled.tape import ONE, ZERO, Value, Writer
 from lmdsl.formulas.compiled.traced import Traced, trace
 from lmdsl.formulas.program import Program
 from lmdsl.problem.problem import Problem
-from lmdsl.systems.runge_kutta import RungeKutta
+from lmdsl.systems.runge_kutta import RungeKutta, rk4
 
 Registers = NDArray[np.int64]
 
@@ -86,9 +86,7 @@ def step(problem: Problem) -> Step:
     if not isinstance(advances, Program | RungeKutta):
         raise BadInput("nothing but its rows is known of the system, so that nothing can be proved "
                        "of what lies between", "system")  # fmt: skip
-    constants = problem.system.constants()
-    stage = [] if problem.cost_rate is not None else [problem.cost()]
-    terminal = problem.terminal()
+    stage = None if problem.cost_rate is not None else problem.program(problem.cost())
     names, states = (problem.controls, problem.noises), problem.states
     path = problem.judged == "path"
     if isinstance(advances, Program):
@@ -101,8 +99,7 @@ def step(problem: Problem) -> Step:
             end = _Maker(states, names, make.components, seeded=False).knot(advances)
     plain = _Maker(states, names, len(states), seeded=True)
     return Step(
-        advance, end, plain.program(Program(stage, constants)),
-        plain.program(Program([] if terminal is None else [terminal], constants)),
+        advance, end, plain.program(stage), plain.program(problem.terminal()),
         getattr(advances, "substeps", 1), path,
         (len(states), make.components, len(names[0]), len(names[1])),
     )  # fmt: skip
@@ -143,9 +140,9 @@ class _Maker:
         """Return tapes without outputs."""
         return self.made([], [])
 
-    def program(self, program: Program) -> Tapes:
-        """Return the tapes of formulas."""
-        if not program.formulas:
+    def program(self, program: Program | None) -> Tapes:
+        """Return the tapes of formulas; without outputs where there are none."""
+        if program is None:
             return self.nothing()
         boxed, centred = (list(trace(program, self.given(n)[1])) for n in (len(self.states), 0))
         return self.made(boxed, centred)
@@ -157,10 +154,15 @@ class _Maker:
 
     def _substep(self, flow: RungeKutta, path: bool, directions: int) -> list[Traced]:
         _, named, parts = self.given(directions)
-        slopes, end = flow.substep(named, tuple(parts), lambda values: trace(flow.field, values))
+        held = dict(named)
+
+        def slope(at: Sequence[Traced]) -> tuple[Traced, ...]:
+            held.update(zip(self.states, at, strict=False))
+            return trace(flow.field, held)
+
+        (k1, k2, k3, k4), end = next(iter(rk4(slope, tuple(parts), flow.h, 1)))
         found, h, d = list(end), flow.h, len(self.states)
         if path:
-            k1, k2, k3, k4 = slopes
             thirds = [(h / 3) * k1[i] for i in range(d)]
             found += [parts[i] + thirds[i] for i in range(d)]
             found += [parts[i] - thirds[i] for i in range(d)]

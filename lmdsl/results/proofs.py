@@ -4,7 +4,7 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.types import Progress
-from lmdsl.errors import BadInput
+from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof.proving import Loop
@@ -17,9 +17,8 @@ def prove(
     result: Result, target: float, time_limit: float | None, progress: Progress | None = None
 ) -> Proof:
     """Prove what becomes of C under the controller of a result; see :meth:`Result.prove`."""
-    target = inputs.number(target, "target")
-    if not 0 < target <= 1:
-        raise BadInput(f"{target!r} is no share; give a number above 0, at most 1", "target")
+    if not (inputs.is_number(target) and 0 < target <= 1):
+        raise BadInput(f"{shown(target)} is no share; give a number above 0, at most 1", "target")
     deadline = Deadline.of(time_limit)
     if not (result.control_index >= 0).any():
         raise BadInput(

@@ -1,4 +1,4 @@
-"""Writing tapes: each operation once, numbers folded, registers shared by what is never needed at once."""
+"""Writing tapes: each operation once, numbers folded, registers used again when they are free."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

@@ -215,7 +215,8 @@ def _power(a: Traced, b: Traced) -> Traced:
     # a^b = exp(b log a), claimed only where a > 0
     log = _smooth("log")(a)
     general = _smooth("exp")(b * log)
-    value = to.emit(machine.CHOOSE_ONE, _condition(to, "<", ZERO, a.value), general.value, _LINE)
+    positive = _condition(to, "<", ZERO, a.value)
+    value: Value = to.emit(machine.CHOOSE_ONE, positive, general.value, _LINE)
     value = to.add(value, to.multiply(value, Fixed(-_FUNCTION, _FUNCTION)))
     return Traced(to, value, general.slope, _rounded(to, general.error, None, value, _FUNCTION))
 

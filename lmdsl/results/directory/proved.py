@@ -40,7 +40,7 @@ def add(path: str | os.PathLike[str], result: Result, proof: Proof) -> None:
     certificate, files = reading.read(folder, content)
     files[NAME] = arrays.packed(proof.arrays())
     said = {name: jsonable(getattr(proof, name)) for name in ProofKeys.model_fields}
-    about = {**certificate, "proof": {**said, "sha256": proof.digest}}
+    about = {**certificate, "proof": said}
 
     def commit(keys: dict[str, Any]) -> bytes:
         return reading.text({**about, **keys})
@@ -85,7 +85,7 @@ def proof_differences(
         found, cells, seconds=said.seconds, holds=holds(result), target=said.target,
         to_stay=result.problem.attractor.empty,
     )  # fmt: skip
-    if said.sha256 != proof.digest:
+    if said.sha256 != proof.sha256:
         reasons.append("proof.sha256 is not that of the boxes")
     for name in (*SHARES, "holds"):
         ours, theirs = getattr(said, name), getattr(proof, name)
