@@ -13,7 +13,7 @@ from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import settling
 from lmdsl.proof.cover import Cover, node_bytes
-from lmdsl.proof.images import Images, deep
+from lmdsl.proof.images.seen import BoxImages, deep
 from lmdsl.proof.search import UNDECIDED, Search
 
 DEEP_FIRST = 0.75  # by how many halvings of its volume a score counts half as much
@@ -21,6 +21,8 @@ EQUAL = 0.5  # share of the best score that is as good
 FEWEST = 0.03  # least share of the undecided leaves that is bisected at a time
 MOST = 2**18  # most leaves that are bisected at a time
 LOOK_AGAIN = 1.5  # growth of the undecided leaves after which those that stay are looked for
+HELPED = 0.99  # share of what was undecided, above which bisecting has not helped
+IN_VAIN, FEW = 8, 20_000  # by how many times the undecided boxes may grow in vain, and from what
 SWEEPS = 500  # of the search for those that stay, before it is given up
 
 
@@ -40,7 +42,7 @@ class Prover:
     """
 
     def __init__(
-        self, cover: Cover, images: Images, factor: float,
+        self, cover: Cover, images: BoxImages, factor: float,
         entry: tuple[Indices, Floats, Floats], settle: bool = True,
     ) -> None:  # fmt: skip
         self.cover, self.images, self.factor = cover, images, factor
@@ -147,6 +149,7 @@ class Prover:
         cover, leaves = self.cover, self.undecided(self.cover.leaves())
         self._looked = len(leaves)
         self.look_for_staying(leaves)
+        seen, boxes = np.inf, FEW  # the undecided share when bisecting last helped
         each = 2 * node_bytes(cover.partition.dimension, len(self.images.noise[0]))
         while True:
             leaves = self.undecided(leaves)
@@ -158,6 +161,10 @@ class Prover:
             if progress is not None:
                 progress("prove", 1.0 - open_)
             if not len(leaves) or deadline() or enough(self.shares()):
+                break
+            if open_ < HELPED * seen:
+                seen, boxes = open_, max(len(leaves), FEW)
+            elif len(leaves) > IN_VAIN * boxes:
                 break
             some = self.chosen(leaves)
             if not len(some) or not memory.fits(each * (2 * len(some) + cover.count)):

@@ -12,9 +12,11 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
-from lmdsl.proof import enclosing, settling
-from lmdsl.proof.cover import Cover, node_bytes, pieces
-from lmdsl.proof.images import Images
+from lmdsl.proof import settling
+from lmdsl.proof.cover import Cover, node_bytes
+from lmdsl.proof.images import enclosing
+from lmdsl.proof.images.pieces import pieces
+from lmdsl.proof.images.seen import BoxImages
 from lmdsl.proof.prover import Prover
 from lmdsl.proof.record import Proof
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
@@ -47,11 +49,11 @@ class Loop(NamedTuple):
         """What the cost after a step counts."""
         return self.problem.gamma * (self.problem.discount or 1.0)
 
-    def images(self, slack: float = 0.0) -> Images:
+    def images(self, slack: float = 0.0) -> BoxImages:
         """Return what encloses images of boxes."""
-        return Images(self.problem, self.partition, self.status, self.control, slack)
+        return BoxImages(self.problem, self.partition, self.status, self.control, slack)
 
-    def entry(self, images: Images) -> tuple[Indices, Floats, Floats]:
+    def entry(self, images: BoxImages) -> tuple[Indices, Floats, Floats]:
         """Return the attractor cells, and bounds of what is paid on entering each."""
         cells = np.flatnonzero(self.status == CellStatus.ATTRACTOR)
         zero, d = np.zeros(len(cells)), self.partition.dimension

@@ -290,7 +290,7 @@ class Result(Summary):
         BadInput
             The system is no formula, or there is no controller.
         """
-        from lmdsl.results.proofs import prove
+        from lmdsl.results.directory.proved import prove
 
         return prove(self, target, time_limit, progress)
 

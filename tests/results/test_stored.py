@@ -99,7 +99,7 @@ def test_a_word_of_a_result_is_plain_text(tmp_path):
 
 def test_what_a_certificate_says_is_what_a_result_holds():
     """A key of the report is saved and read again where the certificate names it, and it does."""
-    apart = {"format", "claims", "measure_residual", "reasons", "versions", "scope"}
+    apart = {"format", "claims", "measure_residual", "reasons", "versions", "scope", "proof"}
     held = {field.name for field in fields(lm.Result)} | {"beyond_gamma", "reward"}
     keys = {*CertificateFile.model_fields}
     assert keys - apart <= held

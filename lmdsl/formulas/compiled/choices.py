@@ -87,11 +87,12 @@ def floors(t, a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def remainder(t, turned, k, b):  # type: ignore[no-untyped-def]
+def remainder(t, turned, k, b, a):  # type: ignore[no-untyped-def]
     """Fill in t = mod(a, b): a - k b, as it is given, where there is one k; else 0 to b."""
     for i in range(t.shape[1]):
         low, high = min(b[0, i], 0.0), max(b[1, i], 0.0)
         if k[0, i] == k[1, i]:
             low, high = max(low, turned[0, i]), min(high, turned[1, i])
-        sound = ((b[0, i] > 0.0) | (b[1, i] < 0.0)) & (high - low < np.inf)
+        apart = (b[0, i] > 0.0) | (b[1, i] < 0.0)
+        sound = apart & ((a[1, i] - a[0, i]) + (b[1, i] - b[0, i]) < np.inf)
         t[0, i], t[1, i] = low if sound else -np.inf, high if sound else np.inf

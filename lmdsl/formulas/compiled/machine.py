@@ -21,7 +21,7 @@ BLOCK = 64  # boxes at a time: registers of all of them lie in a fast cache
 FUNCTION, CONDITION = 32, 64  # first of the elementary functions, and of the conditions
 
 
-class Tape(NamedTuple):
+class IntervalTape(NamedTuple):
     """What a machine runs.
 
     Attributes
@@ -39,7 +39,7 @@ class Tape(NamedTuple):
     constants: Floats
 
 
-def registers(tape: Tape) -> Floats:
+def registers(tape: IntervalTape) -> Floats:
     """Return registers for a tape, its constants in place, shape (registers, 2, BLOCK)."""
     return np.repeat(np.nan_to_num(tape.constants, posinf=np.inf, neginf=-np.inf)[:, :, None],
                      BLOCK, axis=2)  # fmt: skip
@@ -57,7 +57,7 @@ def run(tape, rows):  # type: ignore[no-untyped-def]
         elif op <= CHOOSE_ERROR:
             _error(op, t, a, b, c, d, x)
         elif op <= TURN:
-            _choice(op, t, a, b, c, x)
+            _choice(op, t, a, b, c, d, x)
         elif op < CONDITION:
             functions.apply(op - FUNCTION, t, a)
         else:
@@ -105,7 +105,7 @@ def _error(op, t, a, b, c, d, x):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _choice(op, t, a, b, c, x):  # type: ignore[no-untyped-def]
+def _choice(op, t, a, b, c, d, x):  # type: ignore[no-untyped-def]
     if op == CHOOSE:
         choices.choose(t, a, b, c)
     elif op == CHOOSE_ONE:
@@ -115,7 +115,7 @@ def _choice(op, t, a, b, c, x):  # type: ignore[no-untyped-def]
     elif op == FLOORS:
         choices.floors(t, a, b)
     elif op == REMAINDER:
-        choices.remainder(t, a, b, c)
+        choices.remainder(t, a, b, c, d)
     elif op == SPREAD:
         functions.spread(t, a)
     elif op == POWER:

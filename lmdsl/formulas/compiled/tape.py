@@ -7,11 +7,11 @@ import numpy as np
 
 from lmdsl.formulas import intervals as iv
 from lmdsl.formulas.compiled import machine
-from lmdsl.formulas.compiled.machine import Tape
+from lmdsl.formulas.compiled.machine import IntervalTape
 from lmdsl.formulas.intervals import Interval
 
 
-class Row(NamedTuple):
+class Slot(NamedTuple):
     """What a register will hold."""
 
     key: int
@@ -24,7 +24,7 @@ class Fixed(NamedTuple):
     high: float
 
 
-Value = Row | Fixed
+Value = Slot | Fixed
 
 ZERO, ONE = Fixed(0.0, 0.0), Fixed(1.0, 1.0)
 
@@ -47,17 +47,17 @@ class Writer:
     def __init__(self, inputs: int) -> None:
         self.inputs = inputs
         self._written: list[_Written] = []
-        self._known: dict[_Written, Row] = {}
+        self._known: dict[_Written, Slot] = {}
 
-    def input(self, k: int) -> Row:
+    def input(self, k: int) -> Slot:
         """Return the k-th of the rows that are given."""
-        return Row(k)
+        return Slot(k)
 
-    def emit(self, operation: int, *operands: Value, number: float = 0.0) -> Row:
+    def emit(self, operation: int, *operands: Value, number: float = 0.0) -> Slot:
         """Return the row of an operation."""
         written = _Written(operation, operands, number)
         if written not in self._known:
-            self._known[written] = Row(self.inputs + len(self._written))
+            self._known[written] = Slot(self.inputs + len(self._written))
             self._written.append(written)
         return self._known[written]
 
@@ -105,7 +105,7 @@ class Writer:
 
     def finish(
         self, outputs: Sequence[Value], into: Mapping[int, Value] = {}
-    ) -> tuple[Tape, list[int]]:
+    ) -> tuple[IntervalTape, list[int]]:
         """Return the tape, and the registers of what is asked for.
 
         ``into`` names input registers that hold something else at the end, as the next run needs
@@ -145,21 +145,21 @@ class _Allocation:
 
     def _needed(self) -> dict[int, _Written]:
         writer = self.writer
-        needed = {x.key for x in (*self.outputs, *self.into.values()) if isinstance(x, Row)}
+        needed = {x.key for x in (*self.outputs, *self.into.values()) if isinstance(x, Slot)}
         kept: dict[int, _Written] = {}
         for k in range(len(writer.written) - 1, -1, -1):
             key = writer.inputs + k
             if key in needed:
                 kept[key] = writer.written[k]
-                needed.update(x.key for x in writer.written[k].operands if isinstance(x, Row))
+                needed.update(x.key for x in writer.written[k].operands if isinstance(x, Slot))
         return dict(reversed(kept.items()))
 
     def _last_uses(self, needed: Mapping[int, _Written]) -> dict[int, int]:
         last: dict[int, int] = {}
         for key, written in needed.items():
-            last.update({x.key: key for x in written.operands if isinstance(x, Row)})
+            last.update({x.key: key for x in written.operands if isinstance(x, Slot)})
         for x in (*self.outputs, *self.into.values()):
-            if isinstance(x, Row):
+            if isinstance(x, Slot):
                 last[x.key] = -1  # to the end
         return last
 
@@ -176,7 +176,7 @@ class _Allocation:
         self._note(
             written.operation, target, [self._register(x) for x in written.operands], written.number
         )
-        for other in {x.key for x in written.operands if isinstance(x, Row)}:
+        for other in {x.key for x in written.operands if isinstance(x, Slot)}:
             if self.last[other] == key and other >= self.writer.inputs:
                 self.free.append(self.place[other])
 
@@ -187,11 +187,11 @@ class _Allocation:
         self.code.append([operation, target, *operands, *[zero] * (4 - len(operands))])
         self.number.append(number)
 
-    def done(self) -> tuple[Tape, list[int]]:
+    def done(self) -> tuple[IntervalTape, list[int]]:
         """Return the tape, copies at its end, and the registers of the outputs."""
         places = []
         for x in self.outputs:
-            if self.into and isinstance(x, Row) and x.key in self.into:
+            if self.into and isinstance(x, Slot) and x.key in self.into:
                 self._note(machine.COPY, self.count, [self._register(x)])
                 places.append(self.count)
                 self.count += 1
@@ -208,7 +208,7 @@ class _Allocation:
         for value, k in self.constants.items():
             constants[k] = value
         code = np.array(self.code, dtype=np.int64).reshape(-1, 6)
-        return Tape(code, np.array(self.number), constants), places
+        return IntervalTape(code, np.array(self.number), constants), places
 
 
 def _interval(a: Fixed) -> Interval:

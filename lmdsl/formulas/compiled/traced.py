@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from lmdsl.formulas import intervals as iv
 from lmdsl.formulas.compiled import choices, functions, machine
-from lmdsl.formulas.compiled.tape import ONE, ZERO, Fixed, Row, Value, Writer
+from lmdsl.formulas.compiled.tape import ONE, ZERO, Fixed, Slot, Value, Writer
 from lmdsl.formulas.operations import CONNECTIVES, FORMULA_FUNCTIONS
 from lmdsl.formulas.program import Program
 
@@ -119,24 +119,20 @@ def _function(to: Writer, name: str, a: Value) -> Value:
     return to.emit(machine.FUNCTION + functions.NAMES.index(name), a)
 
 
-def _inverse(to: Writer, a: Value) -> Value:
-    return to.divide(ONE, a)
-
-
 # Of a function its derivative, from the writer, the operand's value and its own.
 _DERIVATIVES: Final[dict[str, Callable[[Writer, Value, Value], Value]]] = {
     "sin": lambda to, a, f: _function(to, "cos", a),
     "cos": lambda to, a, f: to.negative(_function(to, "sin", a)),
     "tan": lambda to, a, f: to.add(ONE, to.square(f)),
     "exp": lambda to, a, f: f,
-    "log": lambda to, a, f: _inverse(to, a),
-    "sqrt": lambda to, a, f: _inverse(to, to.multiply(Fixed(2.0, 2.0), f)),
-    "atan": lambda to, a, f: _inverse(to, to.add(ONE, to.square(a))),
+    "log": lambda to, a, f: to.divide(ONE, a),
+    "sqrt": lambda to, a, f: to.divide(ONE, to.multiply(Fixed(2.0, 2.0), f)),
+    "atan": lambda to, a, f: to.divide(ONE, to.add(ONE, to.square(a))),
     "tanh": lambda to, a, f: to.subtract(ONE, to.square(f)),
     "sinh": lambda to, a, f: _function(to, "cosh", a),
     "cosh": lambda to, a, f: _function(to, "sinh", a),
-    "asin": lambda to, a, f: _inverse(to, _leg(to, a)),
-    "acos": lambda to, a, f: to.negative(_inverse(to, _leg(to, a))),
+    "asin": lambda to, a, f: to.divide(ONE, _leg(to, a)),
+    "acos": lambda to, a, f: to.negative(to.divide(ONE, _leg(to, a))),
 }
 
 
@@ -172,7 +168,7 @@ def _absolute(a: Traced) -> Traced:
     return Traced(to, to.emit(machine.ABSOLUTE, a.value), slope, a.error)
 
 
-def _condition(to: Writer, name: str, a: Value, b: Value = ZERO) -> Row:
+def _condition(to: Writer, name: str, a: Value, b: Value = ZERO) -> Slot:
     return to.emit(machine.CONDITION + choices.NAMES.index(name), a, b)
 
 
@@ -240,7 +236,7 @@ def _raised(to: Writer, a: Value, p: float) -> Value:
     if p == 2.0:
         return to.square(a)
     if p < 0.0:
-        return _inverse(to, _raised(to, a, -p))
+        return to.divide(ONE, _raised(to, a, -p))
     return ONE if p == 0.0 else to.emit(machine.POWER, a, number=p)
 
 
@@ -248,14 +244,17 @@ def _remainder(a: Traced, b: Traced) -> Traced:
     to = a.writer
     turns = to.emit(machine.FLOORS, a.value, b.value)
     turned = to.subtract(a.value, to.multiply(turns, b.value))
-    value = to.emit(machine.REMAINDER, turned, turns, b.value)
+    value = to.emit(machine.REMAINDER, turned, turns, b.value, a.value)
     around = to.emit(machine.FLOORS, to.emit(machine.SPREAD, a.value), b.value)
     jump = to.emit(machine.FLAT, around)
     slope: list[Value | None] = []
     for p, q in zip(a.slope, b.slope, strict=True):
         by = _subtracted(to, p, _times(to, q, around))
         slope.append(None if by is None else to.add(by, jump))
-    return Traced(to, value, slope, to.emit(machine.WIDTH, value))
+    moved = _moved(to, turns, b.error)  # the quotient's floor is exact
+    known, width = _rounded(to, a.error, moved, value), to.emit(machine.WIDTH, value)
+    one = _condition(to, "==", turns, turns)
+    return Traced(to, value, slope, to.emit(machine.CHOOSE_ERROR, one, known, width, value))
 
 
 def _where(condition: Traced | Value, a: Traced, b: Traced) -> Traced:
@@ -276,12 +275,12 @@ def _truth(condition: Traced | Value) -> Value:
     return condition.value if isinstance(condition, Traced) else condition
 
 
-def _joined(name: str, writer: Writer, *conditions: Traced | Value) -> Row:
+def _joined(name: str, writer: Writer, *conditions: Traced | Value) -> Slot:
     return _condition(writer, name, *map(_truth, conditions))
 
 
-def _compared(name: str) -> Callable[[Traced, Traced], Row]:
-    def apply(a: Traced, b: Traced) -> Row:
+def _compared(name: str) -> Callable[[Traced, Traced], Slot]:
+    def apply(a: Traced, b: Traced) -> Slot:
         to, plain = a.writer, {">": "<", ">=": "<=", "!=": "=="}.get(name, name)
         first, second = (b, a) if name in (">", ">=") else (a, b)
         found = _condition(to, plain, first.value, second.value)

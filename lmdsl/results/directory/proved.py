@@ -1,4 +1,4 @@
-"""The proof of a directory: proof.npz, and what certificate.json says of it."""
+"""The proof of a result, and what its directory says of it: proof.npz and certificate.json."""
 
 import os
 from typing import Any
@@ -6,21 +6,64 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common import arrays
+from lmdsl.common import arrays, inputs
 from lmdsl.common.records import jsonable
-from lmdsl.common.types import Guard
-from lmdsl.errors import BadInput
+from lmdsl.common.types import Guard, Progress
+from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof import checking
+from lmdsl.proof.proving import Loop
+from lmdsl.proof.proving import prove as proved
 from lmdsl.proof.record import BOX, Proof, expected
 from lmdsl.results.directory import reading, writing
 from lmdsl.results.directory.certificate_file import ProofKeys
 from lmdsl.results.directory.reading import Reading
-from lmdsl.results.proofs import holds, loop_of
 from lmdsl.results.result import Result
 
 NAME = "proof.npz"
 SHARES = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes")
+
+
+def prove(
+    result: Result, target: float, time_limit: float | None, progress: Progress | None = None
+) -> Proof:
+    """Prove what becomes of C under the controller of a result; see :meth:`Result.prove`."""
+    if not (inputs.is_number(target) and 0 < target <= 1):
+        raise BadInput(f"{shown(target)} is no share; give a number above 0, at most 1", "target")
+    deadline = Deadline.of(time_limit)
+    if not (result.control_index >= 0).any():
+        raise BadInput(
+            "there is no controller of which anything could be proved: " + result.message
+        )
+    return proved(loop_of(result), target, deadline, holds(result), progress)
+
+
+def loop_of(result: Result) -> Loop:
+    """Return the closed loop of a result."""
+    index = result.control_index
+    if not _complete(result):
+        raise BadInput("control_index has no control for a cell of C", "solution.npz")
+    return Loop(
+        result.problem, result.partition, result.cell_status,
+        result.control_vectors[np.maximum(index, 0)],
+    )  # fmt: skip
+
+
+def _complete(result: Result) -> bool:
+    """Return whether every cell of C has a control."""
+    return bool((result.control_index[result.cell_status == CellStatus.STABILIZED] >= 0).all())
+
+
+def holds(result: Result) -> bool | None:
+    """Return whether the attractor cells are kept: proved, refuted by a run, or neither."""
+    local = result.local_controller
+    if local is None:
+        return None
+    if local.proved == local.cells:
+        return True
+    return False if local.kept < local.samples else None
 
 
 def add(path: str | os.PathLike[str], result: Result, proof: Proof) -> None:
@@ -70,12 +113,22 @@ def read(path: str | os.PathLike[str], result: Result, said: ProofKeys) -> dict[
     return reading.read(writing.place(path), boxes)
 
 
+def note(said: ProofKeys) -> str:
+    """Return one line on a proof that holds."""
+    return (
+        f"proof of the true map: {100 * said.arrives:.4f} % of C arrives, {100 * said.lost:.4f} % "
+        f"is lost, {100 * said.stays:.4f} % stays elsewhere ({said.boxes:,} boxes checked)"
+    )
+
+
 def proof_differences(
     path: str | os.PathLike[str], result: Result, said: ProofKeys | None, guard: Guard
 ) -> list[str]:
     """Check the proof of a directory box by box; return what does not hold, one sentence each."""
     if said is None:
         return []
+    if not _complete(result):
+        return ["the proof is of no controller: control_index lacks a cell of C"]
     found = read(path, result, said)
     reasons = checking.faults(loop_of(result), found, guard)
     if reasons:

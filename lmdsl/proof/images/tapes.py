@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.errors import BadInput
-from lmdsl.formulas.compiled.machine import Tape
+from lmdsl.formulas.compiled.machine import IntervalTape
 from lmdsl.formulas.compiled.tape import ONE, ZERO, Value, Writer
 from lmdsl.formulas.compiled.traced import Traced, trace
 from lmdsl.formulas.program import Program
@@ -36,8 +36,8 @@ class Tapes(NamedTuple):
         Number of components that the tapes leave where they found them, for the next substep.
     """
 
-    box: Tape
-    centre: Tape
+    box: IntervalTape
+    centre: IntervalTape
     out: Registers
     middle: Registers
     into: int

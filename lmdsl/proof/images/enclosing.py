@@ -12,7 +12,7 @@ from lmdsl.common.types import Floats
 from lmdsl.formulas.compiled.ends import down, up
 from lmdsl.formulas.compiled.machine import BLOCK, registers, run
 from lmdsl.machine.kernels import kernel
-from lmdsl.proof.tapes import Step, Tapes
+from lmdsl.proof.images.tapes import Step, Tapes
 
 HERMITE = 2.0**-46  # relative error of a computed point of an arc, generously
 
@@ -27,7 +27,7 @@ class Given(NamedTuple):
     most: Floats
 
 
-class Found(NamedTuple):
+class Enclosed(NamedTuple):
     """What is enclosed.
 
     Attributes
@@ -51,7 +51,7 @@ class Found(NamedTuple):
     way: Floats
 
 
-class Rows(NamedTuple):
+class Room(NamedTuple):
     """Registers of the tapes of a step, and the sides of boxes about their centres."""
 
     box: Floats
@@ -61,19 +61,19 @@ class Rows(NamedTuple):
     away: Floats
 
 
-def rows(step: Step) -> Rows:
+def rows(step: Step) -> Room:
     """Return registers for a step; threads need their own."""
-    return Rows(
+    return Room(
         registers(step.advance.box), registers(step.advance.centre), registers(step.end.box),
         registers(step.end.centre), np.zeros((step.sizes[0], 2, BLOCK)),
     )  # fmt: skip
 
 
-def enclose(step: Step, given: Given, held: Rows | None = None) -> Found:
+def enclose(step: Step, given: Given, held: Room | None = None) -> Enclosed:
     """Enclose the step on boxes."""
     count, d, m = len(given.low), step.sizes[0], step.sizes[1]
     arcs = step.substeps if step.path else 0
-    found = Found(
+    found = Enclosed(
         np.empty((count, m)), np.empty((count, m)), np.empty((count, m, d)),
         np.empty((count, arcs, d, 2)), np.empty((count, d if step.path else 0, 4)),
     )  # fmt: skip

@@ -1,9 +1,8 @@
 """Images of the boxes of a cover: enclosed, located, and kept."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Indices, Statuses
 from lmdsl.machine import threads
@@ -11,10 +10,9 @@ from lmdsl.model.discretization import noise_parts
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
-from lmdsl.proof import enclosing, places, tapes
-from lmdsl.proof.cover import DEEPEST, Pieces, pieces
+from lmdsl.proof.images import enclosing, places, tapes
+from lmdsl.proof.images.pieces import DEEPEST, Integers, Pieces, pieces
 
-Whole = NDArray[Any]  # whole numbers of any kind
 SOME = 2**13  # boxes enclosed at a time by a thread
 
 
@@ -37,13 +35,13 @@ class Seen(NamedTuple):
 
     owner: Indices
     place: Indices
-    flags: Whole
+    flags: Integers
     dearest: Floats
     cheapest: Floats
-    axis: Whole
+    axis: Integers
 
 
-class Images:
+class BoxImages:
     """The true map under a controller that is constant on cells, on boxes.
 
     Parameters
@@ -69,7 +67,7 @@ class Images:
         kind[status == CellStatus.AVOID] = places.MAY_LEAVE
         self.ground = (self.axes, kind, partition.clip, enclosing.HERMITE)
 
-    def __call__(self, cell: Whole, split: Whole, place: Whole) -> Seen:
+    def __call__(self, cell: Integers, split: Integers, place: Integers) -> Seen:
         """Return what is known of the images of nodes; several threads work."""
         starts = range(0, len(cell), SOME)
 
@@ -84,7 +82,7 @@ class Images:
         rest = (np.concatenate(arrays) for arrays in list(zip(*found, strict=True))[1:])
         return Seen(owner, *rest)
 
-    def part(self, cell: Whole, split: Whole, place: Whole) -> Seen:
+    def part(self, cell: Integers, split: Integers, place: Integers) -> Seen:
         """Return the same by this thread; images of a node stand together, nodes in order."""
         boxes = pieces(self.partition, cell, split, place)
         count, nodes, d = len(boxes.owner), len(cell), self.partition.dimension
@@ -110,7 +108,7 @@ class Images:
         image = np.concatenate(located)[order]
         return Seen(owner[order], image, flags, dearest, cheapest, axis)
 
-    def _located(self, boxes: Pieces, found: enclosing.Found) -> tuple[Indices, Whole]:
+    def _located(self, boxes: Pieces, found: enclosing.Enclosed) -> tuple[Indices, Integers]:
         d = self.partition.dimension
         image = np.empty((len(found.low), d, 2), dtype=np.int64)
         flags = np.zeros(len(found.low), dtype=np.uint8)
@@ -123,7 +121,7 @@ class Images:
         return image, flags & ~np.uint8(places.EMPTY)
 
     def _cost(
-        self, given: enclosing.Given, found: enclosing.Found, flags: Whole
+        self, given: enclosing.Given, found: enclosing.Enclosed, flags: Integers
     ) -> tuple[Floats, Floats]:
         d = self.partition.dimension
         if found.low.shape[1] > d:  # of a rate, paid only until A is entered
@@ -133,7 +131,7 @@ class Images:
         low, high = enclosing.ranges(self.step, self.step.cost, given)
         return low[:, 0], high[:, 0]
 
-    def _axis(self, stretch: Floats, split: Whole) -> Whole:
+    def _axis(self, stretch: Floats, split: Integers) -> Integers:
         size = 2.0 ** -split.astype(np.float64)
         sound = np.asarray(np.isfinite(stretch).all(axis=1))
         worth = np.where(sound[:, None], np.maximum(stretch, 1e-3 * size), size)
@@ -141,6 +139,6 @@ class Images:
         return np.asarray(np.argmax(worth, axis=1))
 
 
-def deep(split: Whole) -> Bools:
+def deep(split: Integers) -> Bools:
     """Return which nodes cannot be bisected any more."""
     return np.asarray((split >= DEEPEST).all(axis=-1))

@@ -1,0 +1,99 @@
+"""Random states of proved boxes, followed by the true map: what is proved of them must happen.
+
+``python tests/helpers/proved_points.py DIR [POINTS]`` does so for a directory that holds a proof.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import numpy as np
+
+import lmdsl as lm
+from lmdsl.machine.deadline import Deadline
+
+ARRIVES, LOST, STAYS = 1, 2, 3
+WATCHED = 200  # steps for which boxes that stay are watched
+
+
+def boxes_of(proof, cells):
+    """The boxes of each cell: a dictionary of positions."""
+    found = {}
+    for i, cell in enumerate(proof.cell.tolist()):
+        found.setdefault(cell, []).append(i)
+    return found
+
+
+def box_at(proof, partition, x):
+    """The box of a state, by its cell and its place there; -1 outside C."""
+    state, (cell,) = partition.enter(x[None])
+    at = []
+    for i in np.flatnonzero(proof.cell == cell):
+        t = (state[0] - partition.low) / partition.width - np.array(
+            partition.multi_index(np.array([cell]))
+        ).ravel()
+        t = np.where(partition.periodic & (t > partition.cells / 2), 0.0, t)
+        where = np.floor(np.clip(t, 0, 1 - 2.0**-33) * 2.0 ** proof.split[i])
+        if (where == proof.place[i]).all():
+            at.append(i)
+    return at[0] if at else -1
+
+
+def drawn(proof, partition, count, rng):
+    """Random states of random boxes, by volume and by number, and their boxes."""
+    volume = 2.0 ** -proof.split.sum(axis=1, dtype=float)
+    by_volume = rng.choice(proof.boxes, size=count // 2, p=volume / volume.sum())
+    box = np.concatenate([by_volume, rng.integers(proof.boxes, size=count - count // 2)])
+    index = np.stack(partition.multi_index(proof.cell[box]), axis=-1)
+    part = (proof.place[box] + rng.random((count, partition.dimension))) / 2.0 ** proof.split[box]
+    return partition.low + (index + part) * partition.width, box
+
+
+def exceptions(result, proof, count, seed=0, x=None, box=None):
+    """Count states that do something else than is proved of them, by what is proved."""
+    rng = np.random.default_rng(seed)
+    if x is None:
+        x, box = drawn(proof, result.partition, count, rng)
+    loop, wrong = result.closed_loop.compiled, {}
+    for kind, name in ((ARRIVES, "arrives"), (LOST, "lost"), (STAYS, "stays")):
+        on = np.flatnonzero(proof.kind[box] == kind)
+        b = box[on]
+        if not len(on):
+            wrong[name] = 0
+            continue
+        steps = WATCHED if kind == STAYS else int(proof.level[b].max())
+        runs = loop.run(x[on], steps, rng, Deadline())
+        bad = runs.outcome != {ARRIVES: 0, LOST: 1, STAYS: 2}[kind]
+        if kind != STAYS:
+            bad |= runs.taken > proof.level[b]
+        if kind == ARRIVES:
+            slack = 1e-9 * (1 + np.abs(runs.cost))
+            bad |= runs.cost > proof.cost_above[b] + slack
+            bad |= runs.cost < proof.cost_below[b] - slack
+        wrong[name] = int(bad.sum())
+    return wrong
+
+
+def proof_of(path):
+    """The result and the proof that a directory holds."""
+    from lmdsl.proof.record import Proof
+    from lmdsl.results.directory import archive, proved
+
+    stored = archive.read(path)
+    result, said = stored.result, stored.certificate.proof
+    arrays = proved.read(path, result, said)
+    cells = int((result.cell_status == 1).sum())
+    return result, Proof.of(arrays, cells, seconds=said.seconds, holds=said.holds,
+                            target=said.target, to_stay=False)  # fmt: skip
+
+
+if __name__ == "__main__":
+    result, proof = proof_of(sys.argv[1])
+    wanted = int(float(sys.argv[2])) if len(sys.argv) > 2 else 10**6
+    began, total = time.monotonic(), {}
+    for part in range(-(-wanted // 10**6)):
+        for name, bad in exceptions(result, proof, min(wanted, 10**6), part).items():
+            total[name] = total.get(name, 0) + bad
+    print(f"lmdsl {lm.__version__}: {wanted} states in {time.monotonic() - began:.0f} s, "
+          f"of which do otherwise: {total}")  # fmt: skip
