@@ -36,8 +36,7 @@ from lmdsl.results.directory.audit import (
     function_differences,
     local_differences,
 )
-from lmdsl.results.directory.proved import note as proof_note
-from lmdsl.results.directory.proved import proof_differences
+from lmdsl.results.directory.proved import proof_findings
 from lmdsl.results.directory.recorded import policy_of
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
@@ -174,10 +173,8 @@ def verify(
     reasons += differences(whole, lp, result, stored.certificate, certificate)
     in_time()
     reasons += local_differences(lp, result, stored.certificate, deadline)
-    wrong = proof_differences(path, result, stored.certificate.proof, in_time)
-    if stored.certificate.proof is not None and not wrong:
-        notes.append(proof_note(stored.certificate.proof))
-    reasons += wrong
+    of_proof = proof_findings(path, result, stored.certificate.proof, in_time)
+    reasons, notes = reasons + of_proof[0], notes + of_proof[1]
     found = Verification(
         not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
     )

@@ -134,7 +134,7 @@ def test_places_hold_every_state_that_images_become(clip):
                 place = cell * 2**32 + int(np.clip(np.floor(t * 2**32), 0, 2**32 - 1))
                 held = begin <= place <= end or begin <= place + n * 2**32 <= end
                 near = min(abs(place - begin), abs(place - end), abs(place + n * 2**32 - end))
-                assert (held or near <= 2)
+                assert held or near <= 2
                 assert not flags & places.EMPTY
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
@@ -11,7 +12,7 @@ from lmdsl.formulas.compiled.tape import ONE, ZERO, Fixed, Slot, Value, Writer
 from lmdsl.formulas.operations import CONNECTIVES, FORMULA_FUNCTIONS
 from lmdsl.formulas.program import Program
 
-_LINE: Final = Fixed(float("-inf"), float("inf"))
+_LINE: Final = Fixed(-math.inf, math.inf)
 _FUNCTION: Final = 2 * iv.FUNCTION_ULPS * iv.ROUNDING
 
 
@@ -25,7 +26,7 @@ class Traced:
 
     def like(self, x: float) -> Traced:
         """Return a number as a jet of the same directions."""
-        number = Fixed(float(x), float(x)) if abs(x) < float("inf") else _LINE
+        number = Fixed(float(x), float(x)) if math.isfinite(x) else _LINE
         return Traced(self.writer, number, [None] * len(self.slope), None)
 
     def __add__(self, other: Any) -> Traced:
@@ -131,13 +132,11 @@ _DERIVATIVES: Final[dict[str, Callable[[Writer, Value, Value], Value]]] = {
     "tanh": lambda to, a, f: to.subtract(ONE, to.square(f)),
     "sinh": lambda to, a, f: _function(to, "cosh", a),
     "cosh": lambda to, a, f: _function(to, "sinh", a),
-    "asin": lambda to, a, f: to.divide(ONE, _leg(to, a)),
-    "acos": lambda to, a, f: to.negative(to.divide(ONE, _leg(to, a))),
+    "asin": lambda to, a, f: to.divide(ONE, _function(to, "sqrt", to.subtract(ONE, to.square(a)))),
+    "acos": lambda to, a, f: to.negative(
+        to.divide(ONE, _function(to, "sqrt", to.subtract(ONE, to.square(a))))
+    ),
 }
-
-
-def _leg(to: Writer, a: Value) -> Value:
-    return _function(to, "sqrt", to.subtract(ONE, to.square(a)))
 
 
 def _smooth(name: str) -> Callable[[Traced], Traced]:

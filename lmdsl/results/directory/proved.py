@@ -121,12 +121,19 @@ def note(said: ProofKeys) -> str:
     )
 
 
-def proof_differences(
+def proof_findings(
     path: str | os.PathLike[str], result: Result, said: ProofKeys | None, guard: Guard
-) -> list[str]:
-    """Check the proof of a directory box by box; return what does not hold, one sentence each."""
+) -> tuple[list[str], list[str]]:
+    """Check the proof of a directory; return what does not hold, and what to know, in sentences."""
     if said is None:
-        return []
+        return [], []
+    reasons = _differences(path, result, said, guard)
+    return reasons, [] if reasons else [note(said)]
+
+
+def _differences(
+    path: str | os.PathLike[str], result: Result, said: ProofKeys, guard: Guard
+) -> list[str]:
     if not _complete(result):
         return ["the proof is of no controller: control_index lacks a cell of C"]
     found = read(path, result, said)
