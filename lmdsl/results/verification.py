@@ -173,8 +173,7 @@ def verify(
     reasons += differences(whole, lp, result, stored.certificate, certificate)
     in_time()
     reasons += local_differences(lp, result, stored.certificate, deadline)
-    of_proof = proof_findings(path, result, stored.certificate.proof, in_time)
-    reasons, notes = reasons + of_proof[0], notes + of_proof[1]
+    reasons += proof_findings(path, result, stored.certificate.proof, in_time, notes)
     found = Verification(
         not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
     )

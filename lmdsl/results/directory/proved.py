@@ -122,13 +122,18 @@ def note(said: ProofKeys) -> str:
 
 
 def proof_findings(
-    path: str | os.PathLike[str], result: Result, said: ProofKeys | None, guard: Guard
-) -> tuple[list[str], list[str]]:
-    """Check the proof of a directory; return what does not hold, and what to know, in sentences."""
+    path: str | os.PathLike[str], result: Result, said: ProofKeys | None, guard: Guard,
+    notes: list[str],
+) -> list[str]:  # fmt: skip
+    """Check the proof of a directory; return what does not hold, one sentence each.
+
+    A proof that holds is added to the notes.
+    """
     if said is None:
-        return [], []
+        return []
     reasons = _differences(path, result, said, guard)
-    return reasons, [] if reasons else [note(said)]
+    notes += [] if reasons else [note(said)]
+    return reasons
 
 
 def _differences(
