@@ -68,6 +68,12 @@ def measure(name: str, repeats: int) -> dict[str, Any]:
             )
         limit = rows[-1]["what"]
         note("compile", lambda: lm.compile(problem), "sample", samples, limit)
+        if problem.judged == "path":
+            system, at_ends = problem.system, "compile, judged at ends of steps"
+            ends = problem.replaced(system=system.replaced(judged="endpoint"))
+            note(at_ends, lambda: lm.compile(ends), "sample", samples)
+            run = "compile, judged along paths"
+            note(run, lambda: lm.compile(problem), "sample", samples, at_ends)
         if (function := _as_function(problem)) is not None:
             run = "compile, a Python function"
             note(run, lambda: lm.compile(function), "sample", samples, "compile")

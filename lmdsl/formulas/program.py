@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Mapping, Sequence
+from operator import is_
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,8 +41,8 @@ class Program:
 
     Attributes
     ----------
-    formulas
-        The formulas.
+    formulas, constants
+        The formulas, and the values of names in them.
     names
         The names that a call must give values for.
     variables, template
@@ -59,13 +60,19 @@ class Program:
 
     def __init__(self, formulas: Sequence[Formula], constants: Mapping[str, float] = {}) -> None:
         self.formulas: tuple[Formula, ...] = tuple(formulas)
+        self.constants = dict(constants)
         self._slots: dict[tuple[object, ...], int] = {}
         self.template: list[float | None] = []  # by slot: a constant, None for what varies
         self.outputs: list[int] = []
         instructions: list[Instruction] = []
+        placed: list[int] = []
+        longest: tuple[Subformula, ...] = ()
         for formula in formulas:
-            placed: list[int] = []
-            for part in formula.subformulas:
+            parts = formula.subformulas
+            known = min(len(parts), len(longest))  # formulas of one recorder begin alike
+            if not all(map(is_, parts[:known], longest)):
+                placed, longest, known = [], (), 0
+            for part in parts[known:]:
                 key, value = self._identify(part, [placed[k] for k in part.operands], constants)
                 slot = self._slots.setdefault(key, len(self.template))
                 if slot == len(self.template):
@@ -73,7 +80,8 @@ class Program:
                     if value is None and part.operands:
                         instructions.append(Instruction(part.operation, key[1], slot))
                 placed.append(slot)
-            self.outputs.append(placed[-1])
+            longest = max(longest, parts, key=len)
+            self.outputs.append(placed[len(parts) - 1])
         self.variables = {str(k[1]): s for k, s in self._slots.items() if k[0] == "name"}
         self.instructions = self._with_lifetimes(_needed(instructions, self.outputs))
         self.names = frozenset(self.variables)

@@ -18,6 +18,10 @@ class Recorder:
         """Return the term of a name."""
         return self._note(Subformula("name", name=name))
 
+    def constant(self, value: float) -> Term:
+        """Return the term of a number."""
+        return self._note(Subformula("constant", value=value))
+
     def replay(self, formulas: Sequence[Formula], values: Mapping[str, Term]) -> tuple[Term, ...]:
         """Return the terms of formulas of some terms; other names stay names."""
         results = []
@@ -40,8 +44,7 @@ class Recorder:
     def operation(self, operation: str, *operands: Term | float) -> Term:
         """Return the term of an operation."""
         places = tuple(
-            (x if isinstance(x, Term) else self._note(Subformula("constant", value=float(x)))).place
-            for x in operands
+            (x if isinstance(x, Term) else self.constant(float(x))).place for x in operands
         )
         return self._note(Subformula(operation, places))
 

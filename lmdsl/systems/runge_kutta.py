@@ -91,31 +91,50 @@ class RungeKutta:
 
     def knots(self, values: Mapping[str, Any], guard: Guard | None = None) -> Iterator[Knot]:
         """Yield the start and the ends of all substeps; the last state is the image."""
-        field, d = partial(self.field, guard=guard), len(self.states)
-        state = self._start(values)
         with np.errstate(all="ignore"):
-            for slopes, end in self._substeps(values, state, field):
-                slope = tuple(self.h * k for k in slopes[0])
-                yield Knot(state, slope, tuple(k[d:] for k in slopes))
-                state = end
-            last = field({**values, **dict(zip(self.states, state, strict=False))})
-            yield Knot(state, tuple(self.h * k for k in last))
+            yield from self._knots(values, self._start(values), partial(self.field, guard=guard))
 
     @cached_property
     def formulas(self) -> tuple[Formula, ...] | None:
         """The images written out as formulas, None where these are too long to be of use."""
-        nodes = sum(len(formula.subformulas) for formula in self.field.formulas)
-        if max(self.effort, self.substeps * nodes) > MOST_WRITTEN:
+        if self._long:
             return None
         recorder = Recorder()
         start = tuple(recorder.name(name) for name in self.states)
+        images = self._last({}, start, self._recorded(recorder))
+        return tuple(recorder.formula(image) for image in images)
+
+    @cached_property
+    def written(self) -> Program | None:
+        """What :meth:`knots` yields as one program: of each knot the state, slope and stages.
+
+        None where it is too long to be of use. What stages have in common is evaluated once.
+        """
+        if self._long:
+            return None
+        recorder = Recorder()
+        start = (
+            *(recorder.name(name) for name in self.states),
+            *(recorder.constant(0.0) for _ in range(self.integrals)),
+        )
+        knots: Iterator[Any] = self._knots({}, start, self._recorded(recorder))
+        terms = [x for knot in knots for x in (*knot.state, *knot.slope, *sum(knot.stages, ()))]
+        return Program([recorder.formula(term) for term in terms], self.field.constants)
+
+    @property
+    def _long(self) -> bool:
+        nodes = sum(len(formula.subformulas) for formula in self.field.formulas)
+        return max(self.effort, self.substeps * nodes) > MOST_WRITTEN
+
+    def _recorded(self, recorder: Recorder) -> Any:
+        """Return the field as a function of terms."""
 
         def slope(values: Mapping[str, Any]) -> tuple[Any, ...]:
             return recorder.replay(
                 self.field.formulas, {name: values[name] for name in self.states}
             )
 
-        return tuple(recorder.formula(image) for image in self._last({}, start, slope))
+        return slope
 
     def enclose(self, values: Mapping[str, Jet], guard: Guard | None = None) -> tuple[Jet, ...]:
         """Enclose the images and their derivatives on boxes."""
@@ -129,6 +148,16 @@ class RungeKutta:
     def _start(self, values: Mapping[str, Any]) -> tuple[Floats, ...]:
         start = tuple(np.asarray(values[name], float) for name in self.states)
         return (*start, *(np.zeros(()) for _ in range(self.integrals)))
+
+    def _knots(
+        self, values: Mapping[str, Any], state: tuple[Any, ...], field: Any
+    ) -> Iterator[Knot]:
+        d = len(self.states)
+        for slopes, end in self._substeps(values, state, field):
+            yield Knot(state, tuple(self.h * k for k in slopes[0]), tuple(k[d:] for k in slopes))
+            state = end
+        last = field({**values, **dict(zip(self.states, state, strict=False))})
+        yield Knot(state, tuple(self.h * k for k in last))
 
     def _last(self, values: Mapping[str, Any], start: tuple[Any, ...], field: Any) -> Any:
         for substep in self._substeps(values, start, field):

@@ -6,7 +6,7 @@ attractor absorbs the sample there; leaving the box or entering avoid is an esca
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +20,7 @@ from lmdsl.systems.runge_kutta import RungeKutta
 NOWHERE = -2  # number of no set of cells: one that no path enters
 
 
+SHORT = 32  # number of doubles of a path up to which all its knots are evaluated before any is kept
 KEPT = 2**23  # number of doubles of paths above which fewer samples are judged at a time
 
 
@@ -160,16 +161,28 @@ class PathJudge:
         outputs, integrals, steps = len(flow.field.formulas), flow.integrals, flow.substeps
         state, slope = (np.empty((steps + 1, outputs, *shape)) for _ in range(2))
         rate = np.empty((steps, 4 * integrals, *shape))
-        for s, knot in enumerate(flow.knots(values, guard)):
-            for k in range(outputs):
-                state[s, k], slope[s, k] = knot.state[k], knot.slope[k]
-            for i, stage in enumerate(knot.stages):
+        found = self._found(values, guard)
+        for s in range(steps + 1):
+            for lines in (state[s], slope[s]):
+                for k in range(outputs):
+                    lines[k] = next(found)
+            for i in range(4 * (s < steps)):
                 for k in range(integrals):
-                    rate[s, 4 * k + i] = stage[k]
+                    rate[s, 4 * k + i] = next(found)
         state, slope, rate = (
             x.reshape(*x.shape[:2], math.prod(shape)) for x in (state, slope, rate)
         )
         return state, slope, rate
+
+    def _found(self, values: Mapping[str, Floats], guard: Guard) -> Iterator[Floats]:
+        """Yield the state, the slope and the stages of one knot after the other."""
+        if path_doubles(self.flow) > SHORT or self.flow.written is None:
+            for knot in self.flow.knots(values, guard):
+                yield from (*knot.state, *knot.slope, *sum(knot.stages, ()))
+            return
+        arrays = list(self.flow.written(values, guard))[::-1]
+        while arrays:  # none is kept when the next one is taken
+            yield arrays.pop()
 
     def _cells(self, state: Floats, count: int) -> Floats:
         """Return the cells of the knots, NaN outside; under ``clip`` the image is moved first."""
