@@ -22,7 +22,7 @@ FEWEST = 0.03  # least share of the undecided leaves that is bisected at a time
 MOST = 2**18  # most leaves that are bisected at a time
 LOOK_AGAIN = 1.5  # growth of the undecided leaves after which those that stay are looked for
 HELPED = 0.99  # share of what was undecided, above which bisecting has not helped
-IN_VAIN, FEW = 8, 20_000  # by how many times the undecided boxes may grow in vain, and from what
+IN_VAIN, FEW = 32, 50_000  # by how many times the undecided boxes may grow in vain, and from what
 SWEEPS = 500  # of the search for those that stay, before it is given up
 
 
@@ -95,6 +95,12 @@ class Prover:
         self._stack[size : size + len(nodes)] = nodes[::-1]
         settling.settle(find, self._stack, size + len(nodes), self.factor)
 
+    def room(self, bisected: int) -> bool:
+        """Return whether there is memory to bisect so many leaves, arrays made anew included."""
+        cover = self.cover
+        each = node_bytes(cover.partition.dimension, len(self.images.noise[0]))
+        return memory.fits(2.0 * each * (2 * bisected + cover.count))
+
     def undecided(self, leaves: Indices) -> Indices:
         """Return which of some leaves are undecided still."""
         tree = self.cover.tree
@@ -150,7 +156,6 @@ class Prover:
         self._looked = len(leaves)
         self.look_for_staying(leaves)
         seen, boxes = np.inf, FEW  # the undecided share when bisecting last helped
-        each = 2 * node_bytes(cover.partition.dimension, len(self.images.noise[0]))
         while True:
             leaves = self.undecided(leaves)
             if len(leaves) > LOOK_AGAIN * self._looked:
@@ -167,7 +172,7 @@ class Prover:
             elif len(leaves) > IN_VAIN * boxes:
                 break
             some = self.chosen(leaves)
-            if not len(some) or not memory.fits(each * (2 * len(some) + cover.count)):
+            if not len(some) or not self.room(len(some)):
                 break
             new = cover.bisect(some)
             self.add(new, some)

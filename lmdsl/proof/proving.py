@@ -20,10 +20,15 @@ from lmdsl.proof.images.seen import BoxImages
 from lmdsl.proof.prover import Prover
 from lmdsl.proof.record import Proof
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
+from lmdsl.proof.tightening import tighten
 
 # Images are widened by so much, in cells, when boxes are chosen, but not when they are checked:
 # other versions of elementary functions differ by less.
 SLACK = 2.0**-36
+
+# Without a time limit bounds of the cost are tightened until there are so many times as many boxes,
+# or so many.
+GROWN, FEW = 4, 200_000
 
 
 class Loop(NamedTuple):
@@ -81,6 +86,7 @@ def prove(
     images, partition = loop.images(SLACK), loop.partition
     each = node_bytes(partition.dimension, len(images.noise[0]))
     memory.require(3.0 * each * partition.size, "the boxes of the proof")
+    limited = deadline.seconds is None
     to_stay = bool(loop.problem.attractor.empty)
     prover = Prover(Cover(partition, loop.status), images, loop.factor, loop.entry(images))
 
@@ -91,6 +97,8 @@ def prove(
         return bool(reached >= target or (reached + open_ < target and open_ < 1.0 - target))
 
     prover.run(enough, deadline, progress)
+    few = max(GROWN * len(prover.cover.leaves()), FEW)
+    tighten(prover, lambda boxes: limited and boxes > few, deadline, progress)
     arrays = boxes(prover)
     cells = int((loop.status == CellStatus.STABILIZED).sum())
     seconds = time.monotonic() - began
@@ -106,7 +114,7 @@ def boxes(prover: Prover) -> dict[str, NDArray[Any]]:
     for decided in (ARRIVES, LOST):
         some = leaves[tree.state[leaves] == decided]
         some = some[np.argsort(tree.level[some], kind="stable")]
-        settling.refine(prover.search, some, prover.factor)
+        settling.refine(prover.search, some, prover.factor, np.zeros(len(some)))
     leaves = leaves[np.argsort(tree.cell[leaves], kind="stable")]
     state = tree.state[leaves]
     arrives, ends = state == ARRIVES, (state == ARRIVES) | (state == LOST)

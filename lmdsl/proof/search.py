@@ -17,14 +17,25 @@ ANY, EVERY, LEAVING = range(3)  # what ends a search: an undecided leaf, nothing
 class Met(NamedTuple):
     """What a search found.
 
-    ``most`` and ``least`` are bounds of the cost over all that is met and arrives; ``level`` is
-    the largest level of what is met.
+    Attributes
+    ----------
+    bits
+        Of every state that is met, 1 << state.
+    leaf
+        An undecided leaf that is met; without one, the dearest that is met and arrives; or -1.
+    most, least
+        Bounds of the cost over all that is met and arrives.
+    near
+        The least upper bound among them.
+    level
+        The largest level of what is met.
     """
 
     bits: int
     leaf: int
     most: float
     least: float
+    near: float
     level: int
 
 
@@ -61,11 +72,12 @@ class Search(NamedTuple):
 def meet(search, b, until):  # type: ignore[no-untyped-def]
     """Return what the images of a node meet; at once, when an undecided leaf is, unless EVERY."""
     tree = search.tree
-    met = Met(0, -1, -np.inf, np.inf, 0)
+    bits, least, most = 0, search.entry[0], search.entry[1]
     if tree.flags[b] & MAY_LEAVE:
-        met = Met(MEETS_LOST, -1, -np.inf, np.inf, 0)
+        bits |= MEETS_LOST
+    met = Met(bits, -1, -np.inf, np.inf, np.inf, 0)
     if tree.flags[b] & MAY_ARRIVE:
-        met = Met(met.bits | MEETS_ARRIVING, -1, search.entry[1], search.entry[0], 0)
+        met = Met(bits | MEETS_ARRIVING, -1, most, least, most, 0)
     for j in range(tree.first[b], tree.first[b] + tree.images[b]):
         image = search.places[j]
         if image[0, 0] > image[0, 1]:
@@ -108,7 +120,7 @@ def _descend(search, root, until, met):  # type: ignore[no-untyped-def]
     """Search below a cell; decided nodes are taken as a whole unless EVERY leaf is asked for."""
     tree, stack = search.tree, search.stack
     low, high = search.odometer[3], search.odometer[4]
-    bits, leaf, most, least, level = met
+    bits, leaf, most, least, near, level = met
     stack[0], size = root, 1
     while size > 0:
         size -= 1
@@ -129,7 +141,9 @@ def _descend(search, root, until, met):  # type: ignore[no-untyped-def]
             continue
         bits |= 1 << state
         if state == ARRIVES:
+            leaf = n if tree.cost[n] > most else leaf
             most, least = max(most, tree.cost[n]), min(least, tree.least[n])
+            near = min(near, tree.cost[n])
             level = max(level, tree.level[n])
         elif state == LOST:
             level = max(level, tree.level[n])
@@ -139,4 +153,4 @@ def _descend(search, root, until, met):  # type: ignore[no-untyped-def]
                 break
         if (until == LEAVING) & (bits & (MEETS_ARRIVING | MEETS_LOST) != 0):
             break
-    return Met(bits, leaf, most, least, level)
+    return Met(bits, leaf, most, least, near, level)

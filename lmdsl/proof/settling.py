@@ -218,8 +218,12 @@ def _depth(tree, n):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def refine(search, leaves, factor):  # type: ignore[no-untyped-def]
-    """Work out levels and bounds of decided leaves, in order of levels, from those they meet."""
+def refine(search, leaves, factor, torn):  # type: ignore[no-untyped-def]
+    """Work out levels and bounds of decided leaves, in order of levels, from those they meet.
+
+    Arriving leaves are noted to wait for the dearest that they meet, and in ``torn`` by how much
+    their upper bound may exceed what it is for smaller boxes.
+    """
     tree = search.tree
     for j in range(len(leaves)):
         b = leaves[j]
@@ -227,3 +231,37 @@ def refine(search, leaves, factor):  # type: ignore[no-untyped-def]
         tree.level[b] = met.level + 1
         if tree.state[b] == ARRIVES:
             tree.cost[b], tree.least[b] = stage_bounds(tree, b, met, factor, SLACK)
+            tree.waits[b] = met.leaf
+            torn[j] = (tree.dearest[b] - tree.cheapest[b]) + factor * (met.most - met.near)
+
+
+@kernel
+def inherit(search, nodes, failed):  # type: ignore[no-untyped-def]
+    """Give the halves of arriving nodes what is known of these, and note which it does not fit.
+
+    The image of a half may reach beyond that of the whole, and meet what does not arrive as soon.
+    """
+    tree = search.tree
+    for j in range(len(nodes)):
+        b = nodes[j]
+        for c in range(tree.child[b], tree.child[b] + 2):
+            tree.state[c], tree.level[c] = ARRIVES, tree.level[b]
+            tree.cost[c], tree.least[c] = tree.cost[b], tree.least[b]
+    for j in range(len(nodes)):
+        b = nodes[j]
+        for c in range(tree.child[b], tree.child[b] + 2):
+            met = meet(search, c, EVERY)
+            if met.bits != MEETS_ARRIVING or met.level >= tree.level[b]:
+                failed[j] = True
+
+
+@kernel
+def blame(tree, leaves, factor, share):  # type: ignore[no-untyped-def]
+    """Add to the volume of leaves that of all whose upper bound is made of theirs.
+
+    By powers of the factor, in reverse order of levels; ``share`` is by node.
+    """
+    for j in range(len(leaves) - 1, -1, -1):
+        b = leaves[j]
+        if tree.waits[b] >= 0:
+            share[tree.waits[b]] += factor * share[b]

@@ -131,7 +131,7 @@ def test_all_noise_counts():
     _, few = proved(data, target=0.999)
     assert few.steps < proof.steps
     data["noise"] = {"w": {"uniform": {"low": 0, "high": 0.16, "points": 1}}}
-    result, proof = proved(data, target=0.999)
+    result, proof = proved(data, target=0.999, time_limit=1)
     assert proof.arrives < 0.5
     assert exceptions(result, proof, 1000)["lost"] == 0
 
