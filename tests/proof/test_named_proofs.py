@@ -1,6 +1,6 @@
 """Proofs of the systems known by name: states of their boxes, followed by the true map.
 
-All of it with more states: ``lmdsl prove DIR``, then ``python tests/helpers/proved_points.py DIR 1e7``.
+All of it, more states: ``lmdsl prove DIR``, then ``tests/helpers/proved_points.py DIR 1e7``.
 """
 
 from __future__ import annotations
