@@ -30,7 +30,7 @@ from lmdsl.proof.search import (
     STAYS,
     meet,
 )
-from lmdsl.proof.settling import stage_bounds
+from lmdsl.proof.settling import stage_bounds, unite_all
 
 SOME = 2**16  # boxes checked between two looks at the clock
 Arrays = dict[str, NDArray[Any]]
@@ -68,6 +68,7 @@ def faults(loop: Loop, arrays: Arrays, guard: Guard) -> list[str]:
         ("least", "lower"),
     ):
         getattr(tree, name)[place] = arrays[array]
+    unite_all(tree, cover.count)
     for start in range(0, count, SOME):
         guard()
         prover.enclose(place[start : start + SOME])

@@ -23,7 +23,7 @@ MOST = 2**18  # most leaves that are bisected at a time
 LOOK_AGAIN = 1.5  # growth of the undecided leaves after which those that stay are looked for
 HELPED = 0.99  # share of what was undecided, above which bisecting has not helped
 IN_VAIN, FEW = 32, 50_000  # by how many times the undecided boxes may grow in vain, and from what
-SWEEPS = 500  # of the search for those that stay, before it is given up
+SWEEPS = 20  # looks at each undecided leaf after which the search for those that stay is given up
 
 
 class Prover:
@@ -143,7 +143,7 @@ class Prover:
         """Decide which undecided leaves stay: the greatest set that none of them leaves."""
         find, left = self.search, leaves.copy()
         settling.mark_inner(find.tree, find.mark, self.cover.count)
-        kept = settling.leave(find, left, SWEEPS)
+        kept = settling.leave(find, left, SWEEPS * len(left) + FEW)
         if kept > 0:
             size = settling.stay(find, left[:kept], self._stack)
             settling.settle(find, self._stack, size, self.factor)

@@ -26,7 +26,7 @@ class Met(NamedTuple):
     most, least
         Bounds of the cost over all that is met and arrives.
     near
-        The least upper bound among them.
+        The least upper bound among them; of nodes taken as a whole the least lower one.
     level
         The largest level of what is met.
     """
@@ -116,8 +116,19 @@ def _meet_cells(search, image, until, met):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _inside(tree, n, low, high):  # type: ignore[no-untyped-def]
+    """Return whether all of a node lies in a range of places within its cell."""
+    for k in range(len(low)):
+        shift = BITS - np.int64(tree.split[n, k])
+        first = np.int64(tree.place[n, k]) << shift
+        if first < low[k] or first + (np.int64(1) << shift) - 1 > high[k]:
+            return False
+    return True
+
+
+@kernel
 def _descend(search, root, until, met):  # type: ignore[no-untyped-def]
-    """Search below a cell; decided nodes are taken as a whole unless EVERY leaf is asked for."""
+    """Search below a cell; decided nodes are taken as a whole, for EVERY leaf if all are met."""
     tree, stack = search.tree, search.stack
     low, high = search.odometer[3], search.odometer[4]
     bits, leaf, most, least, near, level = met
@@ -126,8 +137,9 @@ def _descend(search, root, until, met):  # type: ignore[no-untyped-def]
         size -= 1
         n = stack[size]
         state, child = tree.state[n], tree.child[n]
-        inner = child >= 0
-        if inner & ((state == UNDECIDED) | (until == EVERY)):
+        if (child >= 0) and (
+            state == UNDECIDED or (until == EVERY and not _inside(tree, n, low, high))
+        ):
             if (until == LEAVING) & (search.mark[n] == 0):
                 continue
             axis = tree.axis[n]
@@ -143,7 +155,7 @@ def _descend(search, root, until, met):  # type: ignore[no-untyped-def]
         if state == ARRIVES:
             leaf = n if tree.cost[n] > most else leaf
             most, least = max(most, tree.cost[n]), min(least, tree.least[n])
-            near = min(near, tree.cost[n])
+            near = min(near, tree.least[n] if child >= 0 else tree.cost[n])
             level = max(level, tree.level[n])
         elif state == LOST:
             level = max(level, tree.level[n])

@@ -58,13 +58,9 @@ def decide(tree, b, state, met, stage):  # type: ignore[no-untyped-def]
         tree.cost[b], tree.least[b] = stage[0], stage[1]
     n = tree.parent[b]
     while n >= 0:
-        one, other = tree.child[n], tree.child[n] + 1
-        if tree.state[one] != state or tree.state[other] != state:
+        if tree.state[tree.child[n]] != state or tree.state[tree.child[n] + 1] != state:
             break
-        tree.state[n] = state
-        tree.cost[n] = max(tree.cost[one], tree.cost[other])
-        tree.least[n] = min(tree.least[one], tree.least[other])
-        tree.level[n] = max(tree.level[one], tree.level[other])
+        unite(tree, n)
         n = tree.parent[n]
 
 
@@ -120,15 +116,16 @@ def mark_inner(tree, mark, count):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def leave(search, leaves, sweeps):  # type: ignore[no-untyped-def]
+def leave(search, leaves, most):  # type: ignore[no-untyped-def]
     """Mark undecided leaves that may leave the set of those not marked, until none does.
 
-    ``leaves`` keeps those that stay at its start; return their number, -1 when out of sweeps.
+    ``leaves`` keeps those that stay at its start; return their number, -1 after ``most`` searches.
     """
     tree, mark, n = search.tree, search.mark, len(leaves)
     outside = MEETS_ARRIVING | MEETS_LOST | MEETS_UNDECIDED
-    for sweep in range(sweeps):
-        kept = 0
+    sweep, made = 0, 0
+    while made <= most:
+        kept, sweep, made = 0, sweep + 1, made + n
         for j in range(n):
             b = leaves[j] if sweep % 2 == 0 else leaves[n - 1 - j]
             if meet(search, b, LEAVING).bits & outside:
@@ -231,8 +228,40 @@ def refine(search, leaves, factor, torn):  # type: ignore[no-untyped-def]
         tree.level[b] = met.level + 1
         if tree.state[b] == ARRIVES:
             tree.cost[b], tree.least[b] = stage_bounds(tree, b, met, factor, SLACK)
-            tree.waits[b] = met.leaf
+            tree.waits[b] = _dearest(tree, met.leaf)
             torn[j] = (tree.dearest[b] - tree.cheapest[b]) + factor * (met.most - met.near)
+        n = tree.parent[b]
+        while n >= 0 and tree.state[n] != UNDECIDED:
+            unite(tree, n)
+            n = tree.parent[n]
+
+
+@kernel
+def _dearest(tree, n):  # type: ignore[no-untyped-def]
+    """Return a leaf below a node that is as dear as it is."""
+    while n >= 0 and tree.child[n] >= 0:
+        c = tree.child[n]
+        n = c if tree.cost[c] >= tree.cost[c + 1] else c + 1
+    return n
+
+
+@kernel
+def unite(tree, n):  # type: ignore[no-untyped-def]
+    """Note of a node what its halves have in common: a state, if any, and bounds."""
+    one, other = tree.child[n], tree.child[n] + 1
+    same = tree.state[one] == tree.state[other]
+    tree.state[n] = tree.state[one] if same else UNDECIDED
+    tree.cost[n] = max(tree.cost[one], tree.cost[other])
+    tree.least[n] = min(tree.least[one], tree.least[other])
+    tree.level[n] = max(tree.level[one], tree.level[other])
+
+
+@kernel
+def unite_all(tree, count):  # type: ignore[no-untyped-def]
+    """Note of all nodes that are bisected what their halves have in common; these come later."""
+    for n in range(count - 1, -1, -1):
+        if tree.child[n] >= 0:
+            unite(tree, n)
 
 
 @kernel

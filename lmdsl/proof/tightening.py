@@ -21,6 +21,7 @@ def tighten(
 ) -> None:
     """Bisect arriving boxes until their mean bounds are close, or there are enough boxes."""
     cover = prover.cover
+    whole = np.zeros(0, dtype=np.int64)  # leaves whose halves are not proved to arrive as soon
     while True:
         leaves = arriving(prover)
         torn = np.zeros(len(leaves))
@@ -33,10 +34,11 @@ def tighten(
             progress("tighten", min(1.0, CLOSE / max(gap, CLOSE)))
         if gap <= CLOSE or enough(len(leaves)) or deadline() or not prover.room(len(leaves)):
             break
+        torn[np.isin(leaves, whole)] = 0.0
         some = _loose(prover, leaves, volume, torn)
         if not len(some):
             break
-        _bisect(prover, some)
+        whole = np.concatenate([whole, _bisect(prover, some)])
 
 
 def arriving(prover: Prover) -> Indices:
@@ -63,11 +65,12 @@ def _loose(prover: Prover, leaves: Indices, volume: Floats, torn: Floats) -> Ind
     return np.asarray(leaves[order[:count]])
 
 
-def _bisect(prover: Prover, nodes: Indices) -> None:
-    """Bisect arriving leaves; take it back where the halves are not proved to arrive as soon."""
+def _bisect(prover: Prover, nodes: Indices) -> Indices:
+    """Bisect arriving leaves; return where it was taken back: halves are not proved to arrive."""
     prover.enclose(prover.cover.bisect(nodes))
     tree, failed = prover.cover.tree, np.zeros(len(nodes), dtype=np.bool_)
     settling.inherit(prover.search, nodes, failed)
     gone = (tree.child[nodes[failed]][:, None] + np.arange(2)).ravel()
     tree.images[gone], tree.parent[gone] = 0, -1
     tree.child[nodes[failed]] = -1
+    return np.asarray(nodes[failed])
