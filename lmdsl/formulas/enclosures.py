@@ -30,10 +30,10 @@ from lmdsl.formulas.truths import COMPARED, JOINED, Truth
 
 
 class Jet:
-    """Values N, shape (B,), d derivatives, shape (d, B), and error e, shape (B,); see the module.
+    """Values N, shape B, d derivatives, shape (d, *B), and error e, shape B; see the module.
 
     Arithmetic with jets and numbers works as with arrays, so that a Runge-Kutta step written
-    for arrays encloses as well.
+    for arrays encloses as well. Shapes B that broadcast against each other have as many axes.
     """
 
     __array_ufunc__ = None  # a NumPy number times a jet is the jet's business
@@ -42,12 +42,12 @@ class Jet:
         self.value, self.slope, self.error = value, slope, error
 
     @staticmethod
-    def constant(x: Any, directions: int) -> Jet:
-        """Return a number that does not vary."""
+    def constant(x: Any, directions: int, axes: int = 1) -> Jet:
+        """Return numbers that do not vary, one for all boxes or an array of ``axes`` axes."""
         value = Interval.point(x)
         if not np.isfinite(value.low).all():
             value = iv.outward(np.where(np.isfinite(value.low), value.low, np.nan), value.high)
-        zero = np.zeros((directions, *np.atleast_1d(x).shape))
+        zero = np.zeros((directions, *(np.shape(x) or (1,) * axes)))
         return Jet(value, Interval.point(zero), 0.0)
 
     @staticmethod
@@ -106,12 +106,14 @@ def enclosure(box: Jet, centre: Jet, away: Sequence[Interval]) -> Interval:
     mean = centre.value
     for k, by in enumerate(away):
         slope = Interval(box.slope.low[k], box.slope.high[k])
-        mean = iv.add(mean, iv.multiply(slope, by))
+        if np.any(slope.low) or np.any(slope.high):  # else the shape of this direction stays out
+            mean = iv.add(mean, iv.multiply(slope, by))
     return iv.intersection(box.value, iv.outward(mean.low - box.error, mean.high + box.error))
 
 
 def _jet(x: Any, like: Jet) -> Jet:
-    return x if isinstance(x, Jet) else Jet.constant(x, len(like.slope.low))
+    slope = np.shape(like.slope.low)
+    return x if isinstance(x, Jet) else Jet.constant(x, slope[0], len(slope) - 1)
 
 
 _ROUNDED_UP: Final = 1.0 + 2.0**-47  # more than some dozen sums and products lose

@@ -123,7 +123,13 @@ def multiply(a: Interval, b: Interval) -> Interval:
         low, high = np.minimum(low, p), np.maximum(high, p)
     value = outward(low, high)
     positive = (a.low >= 0) & (b.low >= 0)  # so that the root of a sum of squares is defined
-    return Interval(np.where(positive, np.maximum(value.low, 0.0), value.low), value.high)
+    value = Interval(np.where(positive, np.maximum(value.low, 0.0), value.low), value.high)
+    zero = _is_zero(a) | _is_zero(b)  # 0 stays 0: what does not depend on a variable has no slope
+    return either(zero, Interval.point(0.0), value) if np.any(zero) else value
+
+
+def _is_zero(a: Interval) -> Any:
+    return (a.low == 0) & (a.high == 0)
 
 
 def square(a: Interval) -> Interval:

@@ -185,15 +185,18 @@ class Program:
         guard
             Called before every operation; it may raise.
         """
-        none = Interval.point(np.zeros((0, 1)))
+        axes = max((np.ndim(values[name].low) for name in self.names), default=1)
+        none = Interval.point(np.zeros((0, *(1,) * axes)))
         jets = {name: Jet(values[name], none, 0.0) for name in self.names}
         return tuple(truth(found) for found in self._enclosed(jets, 0, guard))
 
     def _enclosed(
         self, values: Mapping[str, Jet], directions: int, guard: Guard | None
     ) -> list[Any]:
+        axes = max((np.ndim(jet.slope.low) - 1 for jet in values.values()), default=1)
         slots: list[Any] = [
-            None if value is None else Jet.constant(value, directions) for value in self.template
+            None if value is None else Jet.constant(value, directions, axes)
+            for value in self.template
         ]
         for name, slot in self.variables.items():
             slots[slot] = values[name]
