@@ -32,6 +32,7 @@ from lmdsl.model.local.controller import LocalController
 from lmdsl.model.rows import RowArrays, Rows
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.successors.survival import Successors
 from lmdsl.problem.problem import Problem
 
 Levels = tuple[NDArray[np.int32], Indices]  # level and first stabilizing column of every cell
@@ -64,6 +65,9 @@ class StabilizationLP(Frozen):
     weight
         The user's m on C, shape (n,), sum 1; zeros outside the support (all zero where no cell of
         ``measure`` lies in C).
+    sure_levels
+        Shape (N,), where successors are enclosed, else None: number of steps in which some
+        controller surely enters A from all of the cell, 0 on A, -1 where none is known to.
 
     Notes
     -----
@@ -82,6 +86,7 @@ class StabilizationLP(Frozen):
     cost: Floats
     gamma: float
     weight: Floats
+    sure_levels: NDArray[np.int32] | None = None
     _known: InitVar[Levels | None] = None
     _levels: ClassVar[Levels | None] = None
 
@@ -295,7 +300,10 @@ def compile(  # noqa: A001
         LocalController.of(problem, partition, attractor, limit)
     transitions = assemble(problem, partition, progress, deadline)
     sets = transitions.sets
-    found = stabilizable_set.of_problem(problem, transitions, deadline)
+    successors = None
+    if problem.successors == "enclosed":
+        successors = Successors.of(problem, partition, transitions, deadline, progress)
+    found = stabilizable_set.of_problem(problem, transitions, deadline, successors)
     kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
     cells = sets.free[found.inside]
     # The search that found C ends with Algorithm 1 on the surviving pairs.
@@ -313,6 +321,7 @@ def compile(  # noqa: A001
         cost=transitions.cost[kept],
         gamma=problem.gamma,
         weight=sets.weight(cells),
+        sure_levels=None if successors is None else successors.sure_levels(),
         _known=(found.level[found.inside], column),
     )
     views = (lp.controls, lp.control, lp.cost)

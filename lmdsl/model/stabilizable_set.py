@@ -29,6 +29,7 @@ from lmdsl.machine.kernels import kernel
 from lmdsl.model.algorithm_1 import Predecessors, owner, tree
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.rows import Rows
+from lmdsl.model.successors.survival import Successors
 from lmdsl.problem.problem import Problem
 
 
@@ -57,15 +58,23 @@ class Stabilizable:
     # level, pair: algorithm 1 on the surviving pairs, see :func:`tree`; each of shape (F,)
     level: NDArray[np.int32]
     pair: Indices
+    admissible: Bools | None = None  # which pairs enclosures leave, shape (pairs,); None: all
 
 
 def stabilizable(
-    pair_pointer: Indices, rows: Rows, deadline: Deadline | None = None
+    pair_pointer: Indices,
+    rows: Rows,
+    deadline: Deadline | None = None,
+    successors: Successors | None = None,
 ) -> Stabilizable:
-    """Return the greatest set from which A is reached almost surely, and the pairs it keeps."""
+    """Return the greatest set from which A is reached almost surely, and the pairs it keeps.
+
+    With ``successors`` a pair is kept only if all that its image can meet lies in C u A.
+    """
     deadline = Deadline.of(deadline)
     before: Predecessors | None = None
-    alive = np.ones(rows.count, dtype=np.bool_)
+    admissible = None if successors is None else successors.admissible
+    alive = np.ones(rows.count, dtype=np.bool_) if admissible is None else admissible.copy()
     inside = np.ones(rows.columns, dtype=np.bool_)
     choices = np.diff(pair_pointer)
     reaches = None
@@ -76,15 +85,21 @@ def stabilizable(
             reaches = reached
         lost = np.flatnonzero(inside & ~reached)
         if not len(lost):
-            return Stabilizable(inside, alive, reaches, level, pair)
+            return Stabilizable(inside, alive, reaches, level, pair, admissible)
         deadline.raise_if_over("looking for the stabilizable set")
+        if successors is not None:
+            successors.remove(inside & ~reached, alive, inside)
+            continue
         before = before or Predecessors.of(rows)
         cell = owner(pair_pointer)
         _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)
 
 
 def of_problem(
-    problem: Problem, transitions: Transitions, deadline: Deadline | None = None
+    problem: Problem,
+    transitions: Transitions,
+    deadline: Deadline | None = None,
+    successors: Successors | None = None,
 ) -> Stabilizable:
     """Return the stabilizable set of a problem's transitions.
 
@@ -93,19 +108,27 @@ def of_problem(
     gamma b >= 1 it does not, and A has to be reached as without a discount.
     """
     rows = transitions.rows if problem.ends_in_time else transitions.rows.without_end()
-    return stabilizable(transitions.pair_pointer, rows, deadline)
+    return stabilizable(transitions.pair_pointer, rows, deadline, successors)
 
 
 def statuses(transitions: Transitions, found: Stabilizable) -> Statuses:
     """Return the status code of every cell (see :class:`CellStatus`), shape (N,)."""
     free = np.full(len(found.inside), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
     free[~found.reaches] = CellStatus.TRAPPED
-    free[np.diff(transitions.pair_pointer) == 0] = CellStatus.ESCAPES
+    free[_choices(transitions, found.admissible) == 0] = CellStatus.ESCAPES
     free[found.inside] = CellStatus.STABILIZED
     status = np.full(len(transitions.sets.number), CellStatus.AVOID, dtype=np.uint8)
     status[transitions.sets.free] = free
     status[transitions.sets.attractor] = CellStatus.ATTRACTOR
     return status
+
+
+def _choices(transitions: Transitions, admissible: Bools | None) -> Indices:
+    """Return how many admissible pairs every free cell has, shape (F,)."""
+    if admissible is None:
+        return np.diff(transitions.pair_pointer)
+    cells = owner(transitions.pair_pointer)[admissible]
+    return np.bincount(cells, minlength=len(transitions.sets.free))
 
 
 def restrict(

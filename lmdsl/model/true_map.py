@@ -1,6 +1,6 @@
 """The true map x+ = T(x, u, w) of a problem, and the states and cells that its images become."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
@@ -12,6 +12,7 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.base import StateMap
 from lmdsl.systems.black_box.function_map import FunctionMap
+from lmdsl.systems.runge_kutta import Arc, RungeKutta
 
 
 class TrueMap:
@@ -55,6 +56,13 @@ class TrueMap:
         """Enclose images and derivatives on boxes; None where nothing encloses the map."""
         enclose = self.map.enclose
         return None if enclose is None else enclose(self.named(x, u, w), guard)
+
+    def arcs(
+        self, x: Sequence[Jet], u: Sequence[Jet], w: Sequence[Jet], guard: Guard | None = None
+    ) -> Iterator[Arc]:
+        """Enclose the path of a differential equation, substep by substep."""
+        assert isinstance(self.map, RungeKutta)
+        return self.map.arcs(self.named(x, u, w), guard)
 
     def images(
         self, x: Floats, u: Floats, w: Sequence[Floats], guard: Guard | None = None

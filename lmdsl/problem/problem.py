@@ -59,6 +59,10 @@ class Problem(Declared):
         Formula in the states, paid on entering A.
     sampling
         Sample points within a cell for Ulam's method.
+    successors
+        Which cells a pair may lead to: those of its samples (``sampled``, the default), or all
+        that an enclosure of the image of the whole cell meets (``enclosed``): then a pair survives
+        only if all of them lie in C u A, and no run of the map is lost.
     gamma
         Geometric weight of the cost, sum of gamma^n G(x_n, u_n).
     discount
@@ -89,6 +93,7 @@ class Problem(Declared):
     cost_rate: FormulaText | None = None
     terminal_cost: FormulaText | None = None
     sampling: SamplingUnion
+    successors: Literal["sampled", "enclosed"] | None = None
     gamma: Positive = 1.0
     discount: Fractional | None = None
     on_exit: Literal["forbid", "clip"] = "forbid"

@@ -59,6 +59,15 @@ def rk4(
         yield Substep((k1, k2, k3, k4), state)
 
 
+class Arc(NamedTuple):
+    """A substep on boxes, each a jet by axis: its start, the slopes at its ends, and the way."""
+
+    start: tuple[Jet, ...]
+    slope: tuple[Jet, ...]
+    last_slope: tuple[Jet, ...]
+    rise: tuple[Jet, ...]
+
+
 class RungeKutta:
     """x+ = x + h/6 (k1 + 2 k2 + 2 k3 + k4), repeated; h = step / substeps.
 
@@ -144,6 +153,23 @@ class RungeKutta:
                 values, start, partial(self.field.enclose, guard=guard)
             )
         return images
+
+    def arcs(self, values: Mapping[str, Jet], guard: Guard | None = None) -> Iterator[Arc]:
+        """Enclose the path, substep by substep."""
+        start = tuple(values[name] for name in self.states)
+        field = partial(self.field.enclose, guard=guard)
+        with np.errstate(all="ignore"):
+            substeps = list(self._substeps(values, start, field))
+            last = field({**values, **dict(zip(self.states, substeps[-1].end, strict=True))})
+            slopes = [*(substep.slopes[0] for substep in substeps), last]
+            for k, substep in enumerate(substeps):
+                a, b = (tuple(self.h * y for y in slope) for slope in slopes[k : k + 2])
+                rise = tuple(
+                    (self.h / 6) * (p + 2 * q + 2 * r + s)
+                    for p, q, r, s in zip(*substep.slopes, strict=True)
+                )
+                yield Arc(start, a, b, rise)
+                start = substep.end
 
     def _start(self, values: Mapping[str, Any]) -> tuple[Floats, ...]:
         start = tuple(np.asarray(values[name], float) for name in self.states)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Indices
+from lmdsl.common.types import Bools
 from lmdsl.machine import memory
 from lmdsl.machine.kernels import fixed, kernel
 from lmdsl.model.grid.partition import Partition
@@ -47,38 +47,77 @@ def table(cells: Bools, partition: Partition) -> Table:
     for k in range(d):
         np.cumsum(sums, axis=k, out=sums)
     corner = (np.arange(2**d)[:, None] >> np.arange(d)) & 1
-    sign = np.where((d - corner.sum(axis=1)) % 2, -1, 1)
+    sign = np.where((d - corner.sum(axis=1)) % 2, -1, 1).astype(np.int64)
     stride = np.array(sums.strides) // sums.itemsize
     return Table(*(fixed(x) for x in (sums.ravel(), corner, sign, stride)))
+
+
+GOING, ABSORBED, LOST = 0, 1, 2  # what became of a step so far
+
+
+@kernel
+def count(table, first, last, k, part):  # type: ignore[no-untyped-def]
+    """Return how many cells of the set a range holds."""
+    sums, corner, sign, stride = table
+    total = 0
+    for c in range(len(sign)):
+        at = 0
+        for a in range(len(stride)):
+            end = last[k, part, a] + 1 if corner[c, a] else np.int64(first[k, part, a])
+            at += end * stride[a]
+        total += sign[c] * sums[at]
+    return total
 
 
 @kernel
 def meets(table, first, last, k):  # type: ignore[no-untyped-def]
     """Return whether a range of pair k, of any part of the noise, holds a cell of the set."""
-    sums, corner, sign, stride = table
+    found = False
     for part in range(first.shape[1]):
-        total = 0
-        for c in range(len(sign)):
-            at = 0
-            for a in range(len(stride)):
-                end = last[k, part, a] + 1 if corner[c, a] else first[k, part, a]
-                at += np.int64(end) * stride[a]
-            total += sign[c] * sums[at]
-        if total > 0:
-            return True
-    return False
+        found = found or count(table, first, last, k, part) > 0
+    return found
 
 
 @kernel
-def hulls(pair_pointer, first, last, least, most):  # type: ignore[no-untyped-def]
-    """Fill in the hull of all ranges of every cell, shape (cells, 1, d)."""
+def keep(table, first, last, kept):  # type: ignore[no-untyped-def]
+    """Unmark the pairs of which a range holds a cell of the set."""
+    for k in range(len(kept)):
+        kept[k] = kept[k] and not meets(table, first, last, k)
+
+
+@kernel
+def judge(judged, first, last, out, way, state):  # type: ignore[no-untyped-def]
+    """Let ranges decide what becomes of steps, on the way or at its end, shape (pairs, parts).
+
+    Where a step was absorbed before, its range becomes the cell for that.
+    """
+    avoid, attractor, absorbed = judged
+    for k in range(len(first)):
+        for part in range(first.shape[1]):
+            if state[k, part] == GOING:
+                if out[k, part] or count(avoid, first, last, k, part) > 0:
+                    state[k, part] = LOST
+                elif way:
+                    cells = np.int64(1)
+                    for a in range(first.shape[2]):
+                        cells *= np.int64(last[k, part, a]) - np.int64(first[k, part, a]) + 1
+                    if count(attractor, first, last, k, part) == cells:
+                        state[k, part] = ABSORBED
+            if state[k, part] == ABSORBED:
+                for a in range(first.shape[2]):
+                    first[k, part, a] = last[k, part, a] = absorbed[a]
+
+
+@kernel
+def hulls(pairs, first, last, least, most):  # type: ignore[no-untyped-def]
+    """Fill in the hulls of all ranges of every cell, shape (cells, 1, d)."""
     for i in range(len(least)):
         for a in range(least.shape[2]):
-            low, high = least[i, 0, a], most[i, 0, a]
-            for k in range(pair_pointer[i], pair_pointer[i + 1]):
+            for k in range(pairs[i], pairs[i + 1]):
                 for part in range(first.shape[1]):
-                    low, high = min(low, first[k, part, a]), max(high, last[k, part, a])
-            least[i, 0, a], most[i, 0, a] = low, high
+                    if (k == pairs[i] and part == 0) or first[k, part, a] < least[i, 0, a]:
+                        least[i, 0, a] = first[k, part, a]
+                    most[i, 0, a] = max(most[i, 0, a], last[k, part, a])
 
 
 @kernel
@@ -96,18 +135,15 @@ def drop(table, reach, pairs, ranges, alive, choices):  # type: ignore[no-untype
 
 
 @kernel
-def lift(front, others, reach, pairs, ranges, alive, level, pair):  # type: ignore[no-untyped-def]
-    """Put cells without level on the next one if a pair of theirs meets none of the others.
+def lift(front, others, reach, pairs, ranges, alive, level, chosen):  # type: ignore[no-untyped-def]
+    """Choose the cells without level of which a pair meets none of the others.
 
-    ``front`` is the table of the cells of the last level, ``others`` that of those without level:
-    who cannot meet the first was looked at before.
+    ``front`` is the table of the cells of the last level, ``others`` that of those without level,
+    and of avoid: who cannot meet the first was looked at before.
     """
-    lifted = 0
     for i in range(len(level)):
         if level[i] < 0 and meets(front, reach[0], reach[1], i):
             for k in range(pairs[i], pairs[i + 1]):
                 if alive[k] and not meets(others, ranges[0], ranges[1], k):
-                    pair[i] = k
-                    lifted += 1
+                    chosen[i] = True
                     break
-    return lifted

@@ -1,21 +1,33 @@
-"""Enclosures of the images of boxes: the natural and the mean value form, intersected.
+"""Enclosures of images and paths of boxes: the natural and the mean value form, intersected.
 
 Boxes are given axis by axis, as intervals of shapes that broadcast against each other. So what
 depends on the angle and the controls only is enclosed once for all positions.
+
+The path of a substep is a cubic Hermite arc. A part of it lies in the hull of its four Bernstein
+points, which are the start and multiples of the two slopes and of the way (see :func:`_blossoms`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from functools import reduce
+from itertools import pairwise
+from operator import add
 from typing import NamedTuple
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Guard
-from lmdsl.errors import BadInput
+from lmdsl.common.types import Bools, Floats, Guard
 from lmdsl.formulas import intervals as iv
 from lmdsl.formulas.enclosures import Jet, enclosure
 from lmdsl.formulas.intervals import Interval
 from lmdsl.model.discretization import noise_parts
 from lmdsl.model.true_map import TrueMap
+from lmdsl.systems.runge_kutta import Arc
+
+MOST_PARTS = 8  # most parts of an arc
+SLACK = 2.0**-40  # of slopes and ways: more than what rounds in Bernstein points
+
+
+Arguments = tuple[list[Jet], list[Jet], list[Jet]]  # states, controls and noise
 
 
 class Boxes(NamedTuple):
@@ -24,6 +36,23 @@ class Boxes(NamedTuple):
     states: Sequence[Interval]
     controls: Sequence[Floats]
     noise: Sequence[Interval]
+
+
+class Stretch(NamedTuple):
+    """Where images or a part of the path lie.
+
+    Attributes
+    ----------
+    places
+        An interval for each axis, each in the shape of what it depends on; its ends are infinite
+        where the place may be undefined or infinite.
+    rises, falls
+        By axis, where the path begins: whether it certainly never goes below, or above, its start.
+    """
+
+    places: tuple[Interval, ...]
+    rises: tuple[Bools, ...] = ()
+    falls: tuple[Bools, ...] = ()
 
 
 class Encloser:
@@ -35,6 +64,8 @@ class Encloser:
         The boxes of noise that are covered, one interval of shape (parts,) for each variable.
     directions
         Number of states and of noise variables whose parts are no points.
+    arc_parts
+        Number of parts into which arcs are cut.
     """
 
     def __init__(self, true_map: TrueMap) -> None:
@@ -45,20 +76,40 @@ class Encloser:
         self.varying = [j for j, part in enumerate(self.noise) if (part.low < part.high).any()]
         self.width = true_map.partition.width
         self.directions = len(self.width) + len(self.varying)
+        self.arc_parts = 1
 
-    def __call__(self, boxes: Boxes, guard: Guard | None = None) -> tuple[Interval, ...]:
-        """Enclose the images of all boxes: an interval for each axis.
-
-        Each comes in the shape of what it depends on; its ends are infinite where the image may be
-        undefined or infinite.
-        """
-        directed = self._directed(boxes)
-        middle = [Interval.point(x.midpoint) for x in directed]
-        away = [iv.subtract(x, m) for x, m in zip(directed, middle, strict=True)]
-        around = self._jets(boxes, directed, self.directions, guard)
-        centre = self._jets(boxes, middle, 0, guard)
+    def images(self, boxes: Boxes, guard: Guard | None = None) -> Stretch:
+        """Enclose the images of all boxes."""
+        around, centre, away = self._around(boxes)
+        jets = self.true_map.enclose(*around, guard), self.true_map.enclose(*centre, guard)
         with np.errstate(all="ignore"):
-            return tuple(enclosure(box, at, away) for box, at in zip(around, centre, strict=True))
+            return Stretch(
+                tuple(
+                    enclosure(box, at, away)
+                    for box, at in zip(jets[0] or (), jets[1] or (), strict=True)
+                )
+            )
+
+    def path(self, boxes: Boxes, guard: Guard | None = None) -> Iterator[Stretch]:
+        """Enclose the parts of the path, in order; the end is not among them."""
+        around, centre, away = self._around(boxes)
+        begun = False
+        for arc in zip(
+            self.true_map.arcs(*around, guard), self.true_map.arcs(*centre, guard), strict=True
+        ):
+            with np.errstate(all="ignore"):
+                for points in _blossoms(self.arc_parts):
+                    yield self._stretch(arc, points, away, begun)
+                    begun = True
+
+    def speed(self, boxes: Boxes, guard: Guard | None = None) -> Floats:
+        """Return how far the substeps lead at most, in cells of an axis."""
+        around, _, _ = self._around(boxes)
+        most = np.zeros(())
+        for arc in self.true_map.arcs(*around, guard):
+            for rise, width in zip(arc.rise, self.width, strict=True):
+                most = np.maximum(most, iv.magnitude(rise.value) / width)
+        return most
 
     def excess(self, boxes: Boxes, guard: Guard | None = None) -> list[Floats]:
         """Return by how much the mean value form is too wide, in cells, at first order.
@@ -66,35 +117,83 @@ class Encloser:
         That is what cutting the boxes removes: an array for every state, and then for every noise
         variable that varies.
         """
-        directed = self._directed(boxes)
-        around, total = self._jets(boxes, directed, self.directions, guard), []
-        for i, box in enumerate(directed):
+        around, _, _ = self._around(boxes)
+        images, total = self.true_map.enclose(*around, guard), []
+        for i, box in enumerate(self._directed(boxes)):
             worst = np.zeros(())
-            for jet, width in zip(around, self.width, strict=True):
+            for jet, width in zip(images or (), self.width, strict=True):
                 slack = (jet.slope.high[i] - jet.slope.low[i]) / 2 * (box.high - box.low) / width
                 worst = np.maximum(worst, np.where(np.isnan(slack), np.inf, slack))
             total.append(worst)
         return total
 
+    def _around(self, boxes: Boxes) -> tuple[Arguments, Arguments, list[Interval]]:
+        """Return the jets of boxes and of their midpoints, and the boxes minus these."""
+        directed = self._directed(boxes)
+        middle = [Interval.point(x.midpoint) for x in directed]
+        away = [iv.subtract(x, m) for x, m in zip(directed, middle, strict=True)]
+        n = self.directions
+        around = [Jet.variable(x, k, n) for k, x in enumerate(directed)]
+        centre = [Jet.held(x, 0) for x in middle]
+        return self._jets(boxes, around, n), self._jets(boxes, centre, 0), away
+
+    def _jets(self, boxes: Boxes, directed: Sequence[Jet], directions: int) -> Arguments:
+        d = len(boxes.states)
+        noise = [Jet.held(w, directions) for w in boxes.noise]
+        for jet, j in zip(directed[d:], self.varying, strict=True):
+            noise[j] = jet
+        controls = [Jet.constant(u, directions) for u in boxes.controls]
+        return list(directed[:d]), controls, noise
+
     def _directed(self, boxes: Boxes) -> list[Interval]:
         return [*boxes.states, *(boxes.noise[j] for j in self.varying)]
 
-    def _jets(
-        self, boxes: Boxes, directed: Sequence[Interval], directions: int, guard: Guard | None
-    ) -> tuple[Jet, ...]:
-        d = len(boxes.states)
+    def _stretch(
+        self,
+        arcs: tuple[Arc, Arc],
+        points: Sequence[tuple[float, float, float]],
+        away: Sequence[Interval],
+        begun: bool,
+    ) -> Stretch:
+        """Return the hull of Bernstein points of arcs on boxes and on their midpoints."""
+        places, rises, falls = [], [], []
+        for axis in range(len(self.width)):
+            start, *parts = ([arc[i][axis] for arc in arcs] for i in range(4))
+            slack = sum(iv.magnitude(each[0].value) for each in parts) * SLACK
+            moved = [tuple(_combined(point, parts, i) for i in range(2)) for point in points]
+            found = [enclosure(start[0] + a, start[1] + b, away) for a, b in moved]
+            places.append(_padded(found, slack))
+            if not begun:
+                way = _padded([enclosure(a, b, away) for a, b in moved], slack)
+                rises.append(way.low >= 0)
+                falls.append(way.high <= 0)
+        return Stretch(tuple(places), tuple(rises), tuple(falls))
 
-        def made(k: int) -> Jet:
-            if directions:
-                return Jet.variable(directed[k], k, directions)
-            return Jet.held(directed[k], 0)
 
-        states = [made(k) for k in range(d)]
-        controls = [Jet.constant(u, directions) for u in boxes.controls]
-        noise = [Jet.held(w, directions) for w in boxes.noise]
-        for i, j in enumerate(self.varying):
-            noise[j] = made(d + i)
-        images = self.true_map.enclose(states, controls, noise, guard)
-        if images is None:
-            raise BadInput("this system cannot be enclosed; write it in formulas", "successors")
-        return images
+def _combined(point: Sequence[float], parts: Sequence[Sequence[Jet]], i: int) -> Jet:
+    terms = [c * each[i] for c, each in zip(point, parts, strict=True) if c]
+    return reduce(add, terms) if terms else 0.0 * parts[0][i]
+
+
+def _padded(points: Sequence[Interval], slack: Floats) -> Interval:
+    """Return the hull of points."""
+    low, high = points[0]
+    for point in points[1:]:
+        low, high = np.minimum(low, point.low), np.maximum(high, point.high)
+    return Interval(low - slack, high + slack)
+
+
+def _blossoms(parts: int) -> Iterator[list[tuple[float, float, float]]]:
+    """Yield the Bernstein points of equal parts of an arc: multiples of slope, slope, way.
+
+    With Bernstein points 0, m/3, r - n/3 and r of the whole arc, those of [s, e] are its blossom
+    at (s, s, s), (s, s, e), (s, e, e) and (e, e, e).
+    """
+    cuts = np.linspace(0.0, 1.0, parts + 1).tolist()
+    for s, e in pairwise(cuts):
+        points = []
+        for u, v, w in ((s, s, s), (s, s, e), (s, e, e), (e, e, e)):
+            one = u * (1 - v) * (1 - w) + v * (1 - u) * (1 - w) + w * (1 - u) * (1 - v)
+            two = u * v * (1 - w) + u * w * (1 - v) + v * w * (1 - u)
+            points.append((one / 3, -two / 3, two + u * v * w))
+        yield points

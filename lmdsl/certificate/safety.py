@@ -1,0 +1,18 @@
+"""Claim 7: no run of the map from C is lost, whatever the noise that is covered does.
+
+That is a theorem where, for every pair of the policy, all that the image of the whole cell can meet
+lies in C u A, and its way in the box outside avoid (docs/mathematics.md).
+"""
+
+from lmdsl.common.types import Bools, Guard, Policy
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.sets import CellSets
+from lmdsl.model.successors.inclusion import Inclusion
+
+
+def kept(lp: StabilizationLP, policy: Policy, guard: Guard | None = None) -> Bools:
+    """Return from which cells all that a policy can meet is proved to lie in C u A, shape (n,)."""
+    sets = CellSets.of(lp.problem, lp.partition)
+    allowed = sets.attractor.copy()
+    allowed[lp.cells] = True
+    return Inclusion(lp.problem, lp.partition, sets, allowed)(lp.cells, lp.control[policy], guard)

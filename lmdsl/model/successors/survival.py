@@ -1,0 +1,115 @@
+"""What enclosures leave of a model: the pairs that survive, and where arrival is sure.
+
+A pair is admissible if its range lies in the box outside avoid; it survives while all cells of its
+range lie in C u A. So a run of the map that starts in a cell of C, under a controller that uses
+surviving pairs, never leaves the box, never enters avoid and always finds a control until it enters
+A (docs/mathematics.md). Sampled rows lie within the ranges.
+
+Whole cells are looked at first: most cells cannot meet what has changed.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Bools, Indices, Progress
+from lmdsl.machine import memory
+from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.kernels import fixed
+from lmdsl.model.algorithm_1 import owner
+from lmdsl.model.assembly.transitions import Transitions
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.successors.counting import drop, hulls, lift, table
+from lmdsl.model.successors.ranges import enclosed
+from lmdsl.problem.problem import Problem
+
+DOING = "enclosing images"
+
+
+@dataclass(frozen=True, eq=False)
+class Successors:
+    """The cells that every pair of a problem can meet.
+
+    Attributes
+    ----------
+    admissible
+        Which pairs stay in the box and outside avoid, on the whole cell, shape (pairs,).
+    """
+
+    transitions: Transitions
+    partition: Partition
+    admissible: Bools
+    _ranges: tuple[NDArray[Any], NDArray[Any]]  # of pairs
+    _reach: tuple[NDArray[Any], NDArray[Any]]  # of all pairs of a cell
+    _deadline: Deadline
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        partition: Partition,
+        transitions: Transitions,
+        deadline: Deadline,
+        progress: Progress | None = None,
+    ) -> Self:
+        """Enclose the images of all pairs of some transitions."""
+        pointer, sets = transitions.pair_pointer, transitions.sets
+        cell = sets.free[owner(pointer)]
+        found = enclosed(problem, partition, sets, (cell, transitions.control), deadline, progress)
+        first, last = found.first, found.last
+        memory.require(2.0 * first.itemsize * len(sets.free) * partition.dimension, DOING)
+        shape = (len(sets.free), 1, partition.dimension)
+        least, most = (np.zeros(shape, dtype=first.dtype) for _ in range(2))
+        hulls(fixed(pointer), fixed(first), fixed(last), least, most)
+        ranges, reach = (fixed(first), fixed(last)), (fixed(least), fixed(most))
+        return cls(transitions, partition, ~found.out, ranges, reach, deadline)
+
+    def choices(self, alive: Bools) -> Indices:
+        """Return how many pairs of every free cell are alive, shape (F,)."""
+        own = owner(self.transitions.pair_pointer)
+        return np.bincount(own[alive], minlength=len(self.transitions.sets.free)).astype(np.int64)
+
+    def remove(self, lost: Bools, alive: Bools, inside: Bools) -> None:
+        """Remove free cells, the pairs that can meet them, and cells left without a pair."""
+        pointer = self.transitions.pair_pointer
+        alive &= ~lost[owner(pointer)]
+        choices = self.choices(alive)
+        while lost.any():
+            self._deadline.raise_if_over(DOING)
+            inside &= ~lost
+            removed = table(self._spread(lost), self.partition)
+            drop(removed, self._reach, fixed(pointer), self._ranges, alive, choices)
+            lost = inside & (choices == 0)
+
+    def sure_levels(self) -> NDArray[np.int32]:
+        """Return in how many steps some controller surely enters A, shape (N,): 0 on A, else -1.
+
+        A cell is on level L + 1 if a pair of it has its range in A and the cells of levels up to L.
+        """
+        sets = self.transitions.sets
+        level = np.full(len(sets.free), -1, dtype=np.int32)
+        front, below = sets.attractor, 0
+        while front.any():
+            self._deadline.raise_if_over(DOING)
+            chosen = np.zeros(len(level), dtype=np.bool_)
+            lift(
+                table(front, self.partition),
+                table(self._spread(level < 0) | sets.avoid, self.partition),
+                self._reach, fixed(self.transitions.pair_pointer), self._ranges,
+                fixed(self.admissible), fixed(level), chosen,
+            )  # fmt: skip
+            below += 1
+            level[chosen] = below
+            front = self._spread(chosen)
+        sure = np.full(self.partition.size, -1, dtype=np.int32)
+        sure[sets.attractor] = 0
+        sure[sets.free] = level
+        return sure
+
+    def _spread(self, marked: Bools) -> Bools:
+        """Return marked free cells as cells of the box, shape (N,)."""
+        cells = np.zeros(self.partition.size, dtype=np.bool_)
+        cells[self.transitions.sets.free] = marked
+        return cells
