@@ -1,7 +1,7 @@
 """The certificate: what "verified" means, computed from the finite model and the policy alone.
 
-With u the policy, P_u, G_u its rows, g = max(gamma, 1), five claims, each an inequality between
-stored doubles that holds in exact arithmetic (see bounds.py):
+With u the policy, P_u, G_u its rows, g = max(gamma, 1), claims 1 to 6 are inequalities between
+stored doubles that hold in exact arithmetic (see bounds.py):
 
 1. stabilizing   w > 0, w >= g P_u w + d with d > 0. Then rho(g P_u) <= 1 - min d/w < 1: from every
                  cell of C the chain reaches A (or, discounted, ends) almost surely, geometrically.
@@ -12,6 +12,9 @@ stored doubles that holds in exact arithmetic (see bounds.py):
 5. gap           m'(V_up - W) / m'V_up.
 6. refusal       w >= 0, w != 0, w <= gamma P_a w for every surviving pair: the cells with w > 0
                  have no policy of finite occupation at this gamma.
+
+7. safe          where successors are enclosed: all that the image of a whole cell can meet under
+                 the policy lies in C u A (successors/inclusion.py), so no run of the map is lost.
 
 A solver's status plays no part. A claim that almost holds is repaired or refused, never rounded.
 """
@@ -47,6 +50,8 @@ class Certificate:
         Why it is not verified, one sentence each; empty when verified.
     assumes
         On what every claim rests beside the finite model; empty where on nothing.
+    safe
+        Claim 7; None where successors are not enclosed, or nothing is claimed of a policy.
     """
 
     stabilizing: bool
@@ -62,11 +67,13 @@ class Certificate:
     tolerance: float
     reasons: tuple[str, ...] = ()
     assumes: str = ""
+    safe: bool | None = None
 
     @property
     def verified(self) -> bool:
-        """Claims 1 to 4 hold and the gap is within the tolerance."""
+        """Claims 1 to 4 hold, and 7 where it is made, and the gap is within the tolerance."""
         claims = self.stabilizing and self.upper_bound and self.lower_bound and self.measure
+        claims = claims and self.safe is not False
         return claims and self.gap is not None and self.gap <= self.tolerance
 
     def __str__(self) -> str:
@@ -74,6 +81,11 @@ class Certificate:
             return "; ".join(self.reasons)
         rests = f", assuming that {self.assumes}" if self.assumes else ""
         return f"verified, gap {self.gap:.2g}{rests}"
+
+    @property
+    def claims(self) -> dict[str, bool | None]:
+        """Which claims hold, by name, in the order of their numbers but for the gap."""
+        return {name: getattr(self, name) for name in (*CLAIMS, "refusal", "safe")}
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; ``verified`` first, then the attributes."""

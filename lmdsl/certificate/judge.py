@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.certificate import checks, exact_checks, exact_sums, sums
+from lmdsl.certificate import checks, exact_checks, exact_sums, safety, sums
 from lmdsl.certificate.claims import NOTHING, Certificate, Found, Witness
 from lmdsl.common.types import Floats, Guard, Policy
 from lmdsl.machine import threads
@@ -138,7 +138,7 @@ def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certific
     found |= judged(*(claim for claim in asked if claim not in first))
     known = _holds(found, UPPER_BOUND) and _holds(found, LOWER_BOUND)
     gap = checks.gap(lp, witness.V_up, witness.W) if known else None
-    return _certificate(lp, policy, found, gap, tolerance)
+    return _certificate(lp, policy, found, gap, tolerance, safety.unproved(lp, policy))
 
 
 def exact_verdict(
@@ -164,7 +164,8 @@ def exact_verdict(
     }
     known = _holds(found, UPPER_BOUND) and _holds(found, LOWER_BOUND)
     gap = exact_checks.gap(lp, vectors["V_up"], vectors["W"]) if known else None
-    return _certificate(lp, policy, found, gap, tolerance)
+    unsafe = safety.unproved(lp, policy, guard)
+    return _certificate(lp, policy, found, gap, tolerance, unsafe)
 
 
 def _policy(lp: StabilizationLP, witness: Witness) -> Policy | None:
@@ -187,8 +188,12 @@ def _certificate(
     found: Mapping[str, Found],
     gap: float | None,
     tolerance: float,
+    unsafe: int | None,
 ) -> Certificate:
-    """Return what was found, with the reasons why it is not verified."""
+    """Return what was found, with the reasons why it is not verified.
+
+    ``unsafe`` is the number of cells of which claim 7 is not proved; None where it is not made.
+    """
     holds = {claim.name: _holds(found, claim) for claim in CLAIMS}
     numbers = {
         claim.number: found.get(claim.name, NOTHING).number for claim in CLAIMS if claim.number
@@ -211,11 +216,14 @@ def _certificate(
             reasons.append(
                 f"the gap {gap:.3g} is above the tolerance {tolerance:.3g}" + _too_small(cost)
             )
+        if unsafe:
+            reasons.append(safety.sentence(lp, unsafe))
     said: dict[str, Any] = {**holds, **numbers}
     assumes = lp.problem.system.assumes
     return Certificate(
-        **said, gap=gap, tolerance=tolerance, reasons=tuple(reasons), assumes=assumes
-    )
+        **said, gap=gap, tolerance=tolerance, reasons=tuple(reasons), assumes=assumes,
+        safe=None if unsafe is None else not unsafe,
+    )  # fmt: skip
 
 
 def _too_small(cost: float | None) -> str:

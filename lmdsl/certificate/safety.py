@@ -10,6 +10,24 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.successors.inclusion import Inclusion
 
 
+def unproved(lp: StabilizationLP, policy: Policy | None, guard: Guard | None = None) -> int | None:
+    """Return of how many cells the claim is not proved; None where it is not made.
+
+    The work ends with the first ones: there may be more.
+    """
+    if policy is None or lp.problem.successors != "enclosed":
+        return None
+    return int((~kept(lp, policy, guard)).sum())
+
+
+def sentence(lp: StabilizationLP, unsafe: int) -> str:
+    """Return why a policy is not safe."""
+    return (
+        f"from {unsafe} of {lp.n} cells it is not proved that all that the image of the cell can "
+        "meet lies in C or the attractor"
+    )
+
+
 def kept(lp: StabilizationLP, policy: Policy, guard: Guard | None = None) -> Bools:
     """Return from which cells all that a policy can meet is proved to lie in C u A, shape (n,)."""
     sets = CellSets.of(lp.problem, lp.partition)

@@ -65,6 +65,9 @@ class Result(Summary):
         Shape (N,): ``stability_vector`` and ``refusal_vector``, as they are saved.
     control_vectors
         Shape (M, p).
+    sure_levels
+        Shape (N,), int32, where successors are enclosed, else None: in how many steps some
+        controller surely enters A from all of the cell; 0 on A, -1 where none is known to.
     iterations
         Iterations in the backend's own sense.
     log
@@ -89,6 +92,7 @@ class Result(Summary):
     cell_status: Statuses
     witness: Floats
     control_vectors: Floats
+    sure_levels: NDArray[np.int32] | None = None
     iterations: int | None = None
     log: str = ""
     gap_before_polish: float | None = None
@@ -105,6 +109,11 @@ class Result(Summary):
     def coverage(self) -> Coverage | None:
         """How much of what is neither attractor nor avoided is stabilizable; None if unknown."""
         return None if self.attractor_cells is None else Coverage.of(self.cell_status)
+
+    @property
+    def claims(self) -> dict[str, bool | None]:
+        """Which claims of the certificate hold, by name; None is one that is not made."""
+        return self.certificate.claims
 
     @property
     def reward(self) -> float | None:

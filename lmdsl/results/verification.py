@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl.certificate.claims import Certificate, Witness
-from lmdsl.certificate.judge import CLAIMS, exact_verdict, verdict
+from lmdsl.certificate.judge import exact_verdict, verdict
 from lmdsl.common import inputs
 from lmdsl.common.records import jsonable
 from lmdsl.common.types import Progress
@@ -95,7 +95,7 @@ class Verification:
             "holds": self.holds,
             "status": self.status.value,
             "same_model": self.same_model,
-            "claims": {claim.name: getattr(proof, claim.name) for claim in CLAIMS},
+            "claims": proof.claims,
             "cost": jsonable(proof.cost),
             "lower_bound": jsonable(proof.lower),
             "gap": jsonable(proof.gap),

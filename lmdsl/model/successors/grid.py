@@ -68,8 +68,7 @@ class Grid:
         self.path = problem.judged == "path"
         self.domains: tuple[Domain, ...] = domains(partition, offsets(problem))
         self.controls = np.ascontiguousarray(control_vectors(problem).T)
-        condition, constants = problem.admitted(), problem.system.constants()
-        self.admitted = None if condition is None else Program([condition], constants)
+        self.admitted: Program | None = problem.admitted()
         self.names = (*problem.states, *problem.controls)
         self.pieces = self._cut()
 

@@ -74,7 +74,10 @@ class Inclusion:
     def __call__(
         self, cell: Indices, control: NDArray[np.integer], guard: Guard | None = None
     ) -> Bools:
-        """Return for which pairs that is proved, shape (pairs,); it ends with the first it is not of."""
+        """Return for which pairs that is proved, shape (pairs,).
+
+        The work ends where it is not proved of one: it is of none of those left undecided.
+        """
         proved, boxes = np.ones(len(cell), dtype=np.bool_), self._cells(cell)
         step = max(1, BOXES // self.encloser.parts)
         for cut in range(self.cuts + 1):
@@ -141,7 +144,7 @@ class Inclusion:
             points = map(Interval.point, controls)
             values = dict(zip(self.names, (*states, *points), strict=True))
             surely = self.admitted.decide(values, guard)[0][0]
-            kept &= np.broadcast_to(surely, (count, 1))[:, 0]
+            kept = kept & np.broadcast_to(surely, (count, 1))[:, 0]
         return kept
 
     def _met(

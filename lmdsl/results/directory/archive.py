@@ -32,7 +32,7 @@ from lmdsl.problem.problem import Problem, parse_problem
 from lmdsl.results.directory import reading, writing
 from lmdsl.results.directory.certificate_file import CertificateFile, scope
 from lmdsl.results.directory.reading import FORMAT, Reading
-from lmdsl.results.result import ARRAYS, Result
+from lmdsl.results.result import Result
 from lmdsl.systems import NAMED, DataSystem, FunctionSystem, MatrixSystem, System
 from lmdsl.systems.black_box.cost import FUNCTION
 from lmdsl.systems.matrices.rows import MOST_LIMBS, GivenRows
@@ -47,6 +47,11 @@ TYPES = {
     "cell_status": "|u1",
     "witness": "<f8",
 }
+
+
+def _types(problem: Problem) -> dict[str, str]:
+    """Return the types of the arrays of a solution."""
+    return TYPES | ({"sure_levels": "<i4"} if problem.successors == "enclosed" else {})
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> None:
@@ -101,7 +106,7 @@ def _contents(result: Result) -> dict[str, bytes]:
         data = problem.to_dict()
     contents["problem.json"] = reading.text(data)
     contents["solution.npz"] = arrays.packed(
-        {name: getattr(result, name) for name in (*ARRAYS, "witness")}
+        {name: getattr(result, name) for name in _types(problem)}
     )
     return contents
 
@@ -111,7 +116,7 @@ def _certificate(result: Result) -> dict[str, Any]:
     apart = {
         "format": FORMAT,
         "beyond_gamma": result.beyond_gamma,
-        "claims": {claim.name: getattr(proof, claim.name) for claim in CLAIMS},
+        "claims": proof.claims,
         "measure_residual": proof.measure_residual,
         "reasons": proof.reasons,
         "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
@@ -227,7 +232,9 @@ def _read(files: Reading) -> Stored:
     N = partition.size
     M = min(control_count(problem), 10**40)
     memory.require(64 * N + 8 * M * (2 + len(problem.control_grid)), "arrays of the result")
-    vectors = _arrays(files, "solution.npz", {name: ((N,), kind) for name, kind in TYPES.items()})
+    vectors = _arrays(
+        files, "solution.npz", {name: ((N,), kind) for name, kind in _types(problem).items()}
+    )
     result = _result(problem, partition, stored, vectors)
     return Stored(result, stored, tuple(files.rewritten))
 
@@ -244,7 +251,8 @@ def _result(
     said = dict(stored) | loaded
     known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said}
     proof: dict[str, Any] = {f.name: getattr(stored, f.name, None) for f in fields(Certificate)}
-    proof |= {claim.name: stored.claims.get(claim.name, False) for claim in CLAIMS}
+    proof |= {claim.name: bool(stored.claims.get(claim.name)) for claim in CLAIMS}
+    proof["safe"] = stored.claims.get("safe")
     proof |= {"lower": stored.lower_bound, "assumes": problem.system.assumes}
     certificate = Certificate(**proof)
     return Result(

@@ -47,7 +47,7 @@ def differences(
     """
     reasons = [*_counts(lp, result), *_numbers(result, found), *_outside(lp, result)]
     claims = certificate.claims
-    for name in (claim.name for claim in CLAIMS):
+    for name in (*(claim.name for claim in CLAIMS), "safe"):
         if claims.get(name) is not getattr(found, name):
             reasons.append(_differs(f"claims.{name}", claims.get(name), getattr(found, name)))
     reasons += _residual(lp, result, certificate.measure_residual, found)

@@ -101,7 +101,8 @@ class CertificateFile(_Keys):
     data: Annotated[DataReport | None, _record(DataReport)] = None
     beyond_gamma: dict[str, Any] | None = None
     cause: Word[Cause | None]
-    claims: dict[str, bool]
+    claims: dict[str, bool | None]
+    sure_cells: int | None = None
     measure_residual: Bound | None
     reasons: List[str]
     iterations: int | None
