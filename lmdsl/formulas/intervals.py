@@ -61,9 +61,21 @@ def loosened(low: Any, high: Any) -> Interval:
 
 
 def _widened(low: Any, high: Any, share: float, least: float) -> Interval:
-    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
-    low, high = low - (np.abs(low) * share + least), high + (np.abs(high) * share + least)
-    return Interval(np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high))
+    return Interval(
+        _moved(low, share, least, np.subtract, -np.inf), _moved(high, share, least, np.add, np.inf)
+    )
+
+
+def _moved(end: Any, share: float, least: float, move: np.ufunc, bound: float) -> Floats:
+    """Return an end moved by a share of itself and at least so much, ``bound`` for NaN."""
+    end = np.asarray(end, dtype=np.float64)
+    by = np.empty_like(end)
+    np.abs(end, out=by)
+    by *= share
+    by += least
+    move(end, by, out=by)
+    (np.fmax if bound < 0 else np.fmin)(by, bound, out=by)  # which drop what is not a number
+    return by
 
 
 def magnitude(a: Interval) -> Any:

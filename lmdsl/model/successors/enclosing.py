@@ -4,13 +4,11 @@ Boxes are given axis by axis, as intervals of shapes that broadcast against each
 depends on the angle and the controls only is enclosed once for all positions.
 
 The path of a substep is a cubic Hermite arc. A part of it lies in the hull of its four Bernstein
-points, which are the start and multiples of the two slopes and of the way (see :func:`_blossoms`).
+points, which are the start and sums of multiples of the slopes and the way (:func:`_blossoms`).
 """
 
 from collections.abc import Iterator, Sequence
-from functools import reduce
 from itertools import pairwise
-from operator import add
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +19,6 @@ from lmdsl.formulas.enclosures import Jet, enclosure
 from lmdsl.formulas.intervals import Interval
 from lmdsl.model.discretization import noise_parts
 from lmdsl.model.true_map import TrueMap
-from lmdsl.systems.runge_kutta import Arc
 
 MOST_PARTS = 8  # most parts of an arc
 SLACK = 2.0**-40  # of slopes and ways: more than what rounds in Bernstein points
@@ -93,13 +90,19 @@ class Encloser:
     def path(self, boxes: Boxes, guard: Guard | None = None) -> Iterator[Stretch]:
         """Enclose the parts of the path, in order; the end is not among them."""
         around, centre, away = self._around(boxes)
+        arcs = self.true_map.arcs(*around, guard), self.true_map.arcs(*centre, guard)
         begun = False
-        for arc in zip(
-            self.true_map.arcs(*around, guard), self.true_map.arcs(*centre, guard), strict=True
-        ):
+        for boxed, middle in zip(*arcs, strict=True):
             with np.errstate(all="ignore"):
+                start, *parts = (
+                    [enclosure(x, at, away) for x, at in zip(xs, ats, strict=True)]
+                    for xs, ats in zip(boxed, middle, strict=True)
+                )
                 for points in _blossoms(self.arc_parts):
-                    yield self._stretch(arc, points, away, begun)
+                    way = [_hull_of(points, each) for each in zip(*parts, strict=True)]
+                    places = tuple(map(iv.add, start, way))
+                    rises, falls = (w.low >= 0 for w in way), (w.high <= 0 for w in way)
+                    yield Stretch(places) if begun else Stretch(places, tuple(rises), tuple(falls))
                     begun = True
 
     def speed(self, boxes: Boxes, guard: Guard | None = None) -> Floats:
@@ -148,38 +151,21 @@ class Encloser:
     def _directed(self, boxes: Boxes) -> list[Interval]:
         return [*boxes.states, *(boxes.noise[j] for j in self.varying)]
 
-    def _stretch(
-        self,
-        arcs: tuple[Arc, Arc],
-        points: Sequence[tuple[float, float, float]],
-        away: Sequence[Interval],
-        begun: bool,
-    ) -> Stretch:
-        """Return the hull of Bernstein points of arcs on boxes and on their midpoints."""
-        places, rises, falls = [], [], []
-        for axis in range(len(self.width)):
-            start, *parts = ([arc[i][axis] for arc in arcs] for i in range(4))
-            slack = sum(iv.magnitude(each[0].value) for each in parts) * SLACK
-            moved = [tuple(_combined(point, parts, i) for i in range(2)) for point in points]
-            found = [enclosure(start[0] + a, start[1] + b, away) for a, b in moved]
-            places.append(_padded(found, slack))
-            if not begun:
-                way = _padded([enclosure(a, b, away) for a, b in moved], slack)
-                rises.append(way.low >= 0)
-                falls.append(way.high <= 0)
-        return Stretch(tuple(places), tuple(rises), tuple(falls))
 
+def _hull_of(points: Sequence[tuple[float, float, float]], parts: Sequence[Interval]) -> Interval:
+    """Return the hull of Bernstein points: sums of multiples of slope, slope and way.
 
-def _combined(point: Sequence[float], parts: Sequence[Sequence[Jet]], i: int) -> Jet:
-    terms = [c * each[i] for c, each in zip(point, parts, strict=True) if c]
-    return reduce(add, terms) if terms else 0.0 * parts[0][i]
-
-
-def _padded(points: Sequence[Interval], slack: Floats) -> Interval:
-    """Return the hull of points."""
-    low, high = points[0]
-    for point in points[1:]:
-        low, high = np.minimum(low, point.low), np.maximum(high, point.high)
+    What rounds in them is far below the slack.
+    """
+    low, high = np.inf, -np.inf
+    for point in points:
+        least, most = 0.0, 0.0
+        for c, part in zip(point, parts, strict=True):
+            if c:
+                a, b = part if c > 0 else (part.high, part.low)
+                least, most = least + c * a, most + c * b
+        low, high = np.minimum(low, least), np.maximum(high, most)
+    slack = SLACK * sum(map(iv.magnitude, parts))
     return Interval(low - slack, high + slack)
 
 

@@ -24,10 +24,12 @@ from lmdsl.model.successors.enclosing import MOST_PARTS, Boxes, Encloser, Stretc
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 
-LANES = 2**19  # number of boxes, each with its control, that are enclosed at a time
+# Number of boxes, each with its control, that are enclosed at a time: that stay in cache; and up to
+# the other number where these stand for many more.
+LANES, MOST_LANES, SHARED = 2**14, 2**19, 8
 PROBED = 2**10  # number of pairs on which it is found out how far to cut
-PIECES = 32  # most pieces of a cell
-TARGET = 0.01  # excess of an enclosure, in cells, up to which cells are not cut any further
+PIECES = 16  # most pieces of a cell
+TARGET = 0.03  # excess of an enclosure, in cells, up to which cells are not cut any further
 SHARE = 0.95  # share of the pairs for which that must hold
 
 Span = tuple[Floats, Floats]  # first and last index, before the modulus; NaN where it can be out
@@ -208,9 +210,10 @@ def union(a: Span, b: Span, axis: AxisCells | None) -> Span:
 def blocks(grid: Grid) -> Iterator[tuple[Block, int]]:
     """Yield blocks in the order of the cells, and the cell after their last.
 
-    They are the largest products of consecutive cells that take no more than LANES boxes.
+    They are the largest products of consecutive cells that take no more boxes than fit.
     """
     shape, M = grid.partition.shape, grid.controls.shape[1]
+    limit = max(LANES, min(MOST_LANES, grid.partition.size * M // SHARED))
     small = Block(tuple((0, min(2, n)) for n in shape), (0, min(2, M)))
     depends = [[n > 1 for n in low.shape] for spans in grid.stretches(small) for low, _ in spans]
 
@@ -218,7 +221,7 @@ def blocks(grid: Grid) -> Iterator[tuple[Block, int]]:
         lengths = [n * q for n, q in zip(spans, grid.pieces, strict=True)]
         lengths += [controls, grid.encloser.parts]
         most = (math.prod(n for n, on in zip(lengths, row, strict=True) if on) for row in depends)
-        return max(most) <= LANES
+        return bool(max(most) <= limit)
 
     sizes = ((k, n) for k in range(len(shape)) for n in _halved(shape[k]))
     k, length = next(

@@ -110,7 +110,7 @@ class Inclusion:
         images = self.true_map(middle, list(u[:, :, None]), noise, guard)
         shape = (len(boxes.owner), self.encloser.parts)
         cell = self.partition.locate([np.broadcast_to(x, shape) for x in images])
-        lost: Bools = ((cell < 0) | ~self.allowed[cell]).any(axis=1)
+        lost: Bools = np.any((cell < 0) | ~self.allowed[cell], axis=1)
         return lost
 
     def _cells(self, cell: Indices) -> _Boxes:
@@ -138,7 +138,7 @@ class Inclusion:
         for stretch in self.encloser.path(every, guard) if self.path else ():
             self._met(stretch, boxes.place, lost, way=True)
         first, last = self._met(self.encloser.images(every, guard), boxes.place, lost)
-        kept: Bools = (lost != counting.LOST).all(axis=1)
+        kept: Bools = np.all(lost != counting.LOST, axis=1)
         counting.keep(self.others, first, last, kept)
         if self.admitted is not None:
             points = map(Interval.point, controls)
