@@ -14,10 +14,10 @@ import numpy as np
 
 from lmdsl.certificate.sums import LEAST as LEAST
 from lmdsl.certificate.sums import UNIT as UNIT
+from lmdsl.certificate.vectors import over_cells, padded
 from lmdsl.common.types import Floats, Indices, Policy
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.vectors import over_cells, padded
 
 # Size of a sum above which it is not believed: one that rounds to infinity exceeds everything.
 LARGEST = 2.0**1000

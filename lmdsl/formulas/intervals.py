@@ -69,7 +69,7 @@ def _widened(low: Any, high: Any, share: float, least: float) -> Interval:
 def _moved(end: Any, share: float, least: float, move: np.ufunc, bound: float) -> Floats:
     """Return an end moved by a share of itself and at least so much, ``bound`` for NaN."""
     end = np.asarray(end, dtype=np.float64)
-    by = np.empty_like(end)
+    by: Floats = np.empty_like(end)
     np.abs(end, out=by)
     by *= share
     by += least

@@ -66,8 +66,7 @@ class StabilizationLP(Frozen):
         The user's m on C, shape (n,), sum 1; zeros outside the support (all zero where no cell of
         ``measure`` lies in C).
     sure_levels
-        Shape (N,), where successors are enclosed, else None: number of steps in which some
-        controller surely enters A from all of the cell, 0 on A, -1 where none is known to.
+        Where successors are enclosed, else None: see :meth:`Successors.sure_levels`.
 
     Notes
     -----
@@ -300,9 +299,7 @@ def compile(  # noqa: A001
         LocalController.of(problem, partition, attractor, limit)
     transitions = assemble(problem, partition, progress, deadline)
     sets = transitions.sets
-    successors = None
-    if problem.successors == "enclosed":
-        successors = Successors.of(problem, partition, transitions, deadline, progress)
+    successors = Successors.asked_for(problem, partition, transitions, deadline, progress)
     found = stabilizable_set.of_problem(problem, transitions, deadline, successors)
     kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
     cells = sets.free[found.inside]

@@ -12,7 +12,7 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.base import StateMap
 from lmdsl.systems.black_box.function_map import FunctionMap
-from lmdsl.systems.runge_kutta import Arc, RungeKutta
+from lmdsl.systems.runge_kutta import ArcJets, RungeKutta
 
 
 class TrueMap:
@@ -59,7 +59,7 @@ class TrueMap:
 
     def arcs(
         self, x: Sequence[Jet], u: Sequence[Jet], w: Sequence[Jet], guard: Guard | None = None
-    ) -> Iterator[Arc]:
+    ) -> Iterator[ArcJets]:
         """Enclose the path of a differential equation, substep by substep."""
         assert isinstance(self.map, RungeKutta)
         return self.map.arcs(self.named(x, u, w), guard)

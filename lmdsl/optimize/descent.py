@@ -15,10 +15,10 @@ from lmdsl.certificate.bounds import (
 )
 from lmdsl.certificate.sums import UNIT as UNIT
 from lmdsl.certificate.sums import rounded_down
+from lmdsl.certificate.vectors import over_cells, padded
 from lmdsl.common.types import Floats, TimeUp, never
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.vectors import over_cells, padded
 from lmdsl.optimize.policies.bellman import improve
 
 MOST_LOWERED = 60  # number of sweeps over the pairs that are open, after which lowering is given up

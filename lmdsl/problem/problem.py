@@ -60,9 +60,8 @@ class Problem(Declared):
     sampling
         Sample points within a cell for Ulam's method.
     successors
-        Which cells a pair may lead to: those of its samples (``sampled``, the default), or all
-        that an enclosure of the image of the whole cell meets (``enclosed``): then a pair survives
-        only if all of them lie in C u A, and no run of the map is lost.
+        ``sampled`` (default), or ``enclosed``: a pair survives only if all that the image of the
+        whole cell can meet lies in C u A, so that no run of the map is lost.
     gamma
         Geometric weight of the cost, sum of gamma^n G(x_n, u_n).
     discount

@@ -212,7 +212,6 @@ class _Job:
             witness=_spread(lp, w, 0.0, 0.0, 0.0),
             control_vectors=lp.controls,
             sure_levels=lp.sure_levels,
-            sure_cells=None if lp.sure_levels is None else int((lp.sure_levels > 0).sum()),
             lp=lp,
             **more,
         )

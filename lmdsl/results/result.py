@@ -111,6 +111,11 @@ class Result(Summary):
         return None if self.attractor_cells is None else Coverage.of(self.cell_status)
 
     @property
+    def sure_cells(self) -> int | None:
+        """Number of cells outside A with a sure level; None unless successors are enclosed."""
+        return None if self.sure_levels is None else int((self.sure_levels > 0).sum())
+
+    @property
     def claims(self) -> dict[str, bool | None]:
         """Which claims of the certificate hold, by name; None is one that is not made."""
         return self.certificate.claims

@@ -110,9 +110,6 @@ class Summary(Frozen):
         Runs of the true map that ``lmdsl solve`` made; None where none was asked for.
     data
         What was recorded, what is assumed and how sure it is; None unless solved from data.
-    sure_cells
-        Number of cells from all of which some controller surely enters A; None unless successors
-        are enclosed.
     integration_error
         How far the compiled steps are from the differential equation; None for a map, for a loaded
         result, and where there was no time.
@@ -140,11 +137,10 @@ class Summary(Frozen):
     simulation: Simulation | None = None
     data: DataReport | None = None
     integration_error: IntegrationError | None = None
-    sure_cells: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
-        later = ("simulation", "data", "integration_error", "sure_cells")
+        later = ("simulation", "data", "integration_error")
         names = [f.name for f in fields(Summary) if f.name not in later]
         return {
             **{name: jsonable(getattr(self, name)) for name in names},
@@ -160,6 +156,11 @@ class Summary(Frozen):
     @property
     def coverage(self) -> Coverage | None:
         """How much of what is neither attractor nor avoided is stabilizable; None if unknown."""
+        return None
+
+    @property
+    def sure_cells(self) -> int | None:
+        """Number of cells from all of which some controller surely enters A; None: not known."""
         return None
 
     @property

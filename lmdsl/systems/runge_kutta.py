@@ -59,7 +59,7 @@ def rk4(
         yield Substep((k1, k2, k3, k4), state)
 
 
-class Arc(NamedTuple):
+class ArcJets(NamedTuple):
     """A substep on boxes, each a jet by axis: its start, the slopes at its ends, and the way."""
 
     start: tuple[Jet, ...]
@@ -154,7 +154,7 @@ class RungeKutta:
             )
         return images
 
-    def arcs(self, values: Mapping[str, Jet], guard: Guard | None = None) -> Iterator[Arc]:
+    def arcs(self, values: Mapping[str, Jet], guard: Guard | None = None) -> Iterator[ArcJets]:
         """Enclose the path, substep by substep."""
         start = tuple(values[name] for name in self.states)
         field = partial(self.field.enclose, guard=guard)
@@ -168,7 +168,7 @@ class RungeKutta:
                     (self.h / 6) * (p + 2 * q + 2 * r + s)
                     for p, q, r, s in zip(*substep.slopes, strict=True)
                 )
-                yield Arc(start, a, b, rise)
+                yield ArcJets(start, a, b, rise)
                 start = substep.end
 
     def _start(self, values: Mapping[str, Any]) -> tuple[Floats, ...]:

@@ -10,7 +10,7 @@ from models import random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl.model import vectors
+from lmdsl.certificate import vectors
 from lmdsl.optimize.feasibility import first_policy
 from lmdsl.optimize.policies import bellman, iteration
 from lmdsl.optimize.policies.screening import Screen

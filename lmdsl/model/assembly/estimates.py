@@ -42,6 +42,9 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
     # Of a pair the row, its end, control and cost; of a cell the sets, levels and weights.
     entries = pilot.entries + (problem.discount is not None)
     model = N * (64 + pairs * (21 + entries * entry))
+    if problem.successors == "enclosed":
+        parts = min(discretization.node_count(problem), 10**40)
+        model += N * pairs * (8 + 4 * parts * len(problem.state_box))
     copied = pairs * (28 + entries * entry) if pilot.admissible < 1 else 0  # cells may be lost
     # Of a pair whether it ties, and a unit cost; of a cell vectors, and the rows of a policy in
     # doubles.
@@ -116,6 +119,8 @@ def work(problem: Problem) -> float:
     for where in ("attractor", "avoid", "measure"):
         for each in problem.conditions(where):
             work += ENCLOSED * N * problem.program(each).work
+    if problem.successors == "enclosed":
+        work += ENCLOSED * lanes * discretization.node_count(problem) * step.work
     density = problem.density()
     if density is not None:
         work += N * density.work

@@ -1,6 +1,6 @@
 """Enclosures of images and paths of boxes: the natural and the mean value form, intersected.
 
-Boxes are given axis by axis, as intervals of shapes that broadcast against each other. So what
+StepBoxes are given axis by axis, as intervals of shapes that broadcast against each other. So what
 depends on the angle and the controls only is enclosed once for all positions.
 
 The path of a substep is a cubic Hermite arc. A part of it lies in the hull of its four Bernstein
@@ -8,6 +8,7 @@ points, which are the start and sums of multiples of the slopes and the way (:fu
 """
 
 from collections.abc import Iterator, Sequence
+from functools import reduce
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -24,10 +25,10 @@ MOST_PARTS = 8  # most parts of an arc
 SLACK = 2.0**-40  # of slopes and ways: more than what rounds in Bernstein points
 
 
-Arguments = tuple[list[Jet], list[Jet], list[Jet]]  # states, controls and noise
+StepJets = tuple[list[Jet], list[Jet], list[Jet]]  # states, controls and noise
 
 
-class Boxes(NamedTuple):
+class StepBoxes(NamedTuple):
     """Boxes of states, controls (numbers) and noise, each by axis; all arrays of as many axes."""
 
     states: Sequence[Interval]
@@ -75,7 +76,7 @@ class Encloser:
         self.directions = len(self.width) + len(self.varying)
         self.arc_parts = 1
 
-    def images(self, boxes: Boxes, guard: Guard | None = None) -> Stretch:
+    def images(self, boxes: StepBoxes, guard: Guard | None = None) -> Stretch:
         """Enclose the images of all boxes."""
         around, centre, away = self._around(boxes)
         jets = self.true_map.enclose(*around, guard), self.true_map.enclose(*centre, guard)
@@ -87,7 +88,7 @@ class Encloser:
                 )
             )
 
-    def path(self, boxes: Boxes, guard: Guard | None = None) -> Iterator[Stretch]:
+    def path(self, boxes: StepBoxes, guard: Guard | None = None) -> Iterator[Stretch]:
         """Enclose the parts of the path, in order; the end is not among them."""
         around, centre, away = self._around(boxes)
         arcs = self.true_map.arcs(*around, guard), self.true_map.arcs(*centre, guard)
@@ -99,13 +100,16 @@ class Encloser:
                     for xs, ats in zip(boxed, middle, strict=True)
                 )
                 for points in _blossoms(self.arc_parts):
-                    way = [_hull_of(points, each) for each in zip(*parts, strict=True)]
-                    places = tuple(map(iv.add, start, way))
-                    rises, falls = (w.low >= 0 for w in way), (w.high <= 0 for w in way)
+                    ways = [_ways(points, each) for each in zip(*parts, strict=True)]
+                    places = tuple(
+                        iv.add(at, iv.hull(way[0], way[1]))
+                        for at, way in zip(start, ways, strict=True)
+                    )
+                    rises, falls = (w[1].low >= 0 for w in ways), (w[1].high <= 0 for w in ways)
                     yield Stretch(places) if begun else Stretch(places, tuple(rises), tuple(falls))
                     begun = True
 
-    def speed(self, boxes: Boxes, guard: Guard | None = None) -> Floats:
+    def speed(self, boxes: StepBoxes, guard: Guard | None = None) -> Floats:
         """Return how far the substeps lead at most, in cells of an axis."""
         around, _, _ = self._around(boxes)
         most = np.zeros(())
@@ -114,7 +118,7 @@ class Encloser:
                 most = np.maximum(most, iv.magnitude(rise.value) / width)
         return most
 
-    def excess(self, boxes: Boxes, guard: Guard | None = None) -> list[Floats]:
+    def excess(self, boxes: StepBoxes, guard: Guard | None = None) -> list[Floats]:
         """Return by how much the mean value form is too wide, in cells, at first order.
 
         That is what cutting the boxes removes: an array for every state, and then for every noise
@@ -130,7 +134,7 @@ class Encloser:
             total.append(worst)
         return total
 
-    def _around(self, boxes: Boxes) -> tuple[Arguments, Arguments, list[Interval]]:
+    def _around(self, boxes: StepBoxes) -> tuple[StepJets, StepJets, list[Interval]]:
         """Return the jets of boxes and of their midpoints, and the boxes minus these."""
         directed = self._directed(boxes)
         middle = [Interval.point(x.midpoint) for x in directed]
@@ -140,7 +144,7 @@ class Encloser:
         centre = [Jet.held(x, 0) for x in middle]
         return self._jets(boxes, around, n), self._jets(boxes, centre, 0), away
 
-    def _jets(self, boxes: Boxes, directed: Sequence[Jet], directions: int) -> Arguments:
+    def _jets(self, boxes: StepBoxes, directed: Sequence[Jet], directions: int) -> StepJets:
         d = len(boxes.states)
         noise = [Jet.held(w, directions) for w in boxes.noise]
         for jet, j in zip(directed[d:], self.varying, strict=True):
@@ -148,25 +152,27 @@ class Encloser:
         controls = [Jet.constant(u, directions) for u in boxes.controls]
         return list(directed[:d]), controls, noise
 
-    def _directed(self, boxes: Boxes) -> list[Interval]:
+    def _directed(self, boxes: StepBoxes) -> list[Interval]:
         return [*boxes.states, *(boxes.noise[j] for j in self.varying)]
 
 
-def _hull_of(points: Sequence[tuple[float, float, float]], parts: Sequence[Interval]) -> Interval:
-    """Return the hull of Bernstein points: sums of multiples of slope, slope and way.
+def _ways(
+    points: Sequence[tuple[float, float, float]], parts: Sequence[Interval]
+) -> tuple[Interval, Interval]:
+    """Return the first Bernstein point of a part of an arc, and the hull of the other three.
 
-    What rounds in them is far below the slack.
+    They are sums of multiples of slope, slope and way, widened by far more than rounds in them and
+    in a computed point between them.
     """
-    low, high = np.inf, -np.inf
+    found, slack = [], SLACK * sum(map(iv.magnitude, parts))
     for point in points:
-        least, most = 0.0, 0.0
+        low, high = 0.0, 0.0
         for c, part in zip(point, parts, strict=True):
             if c:
                 a, b = part if c > 0 else (part.high, part.low)
-                least, most = least + c * a, most + c * b
-        low, high = np.minimum(low, least), np.maximum(high, most)
-    slack = SLACK * sum(map(iv.magnitude, parts))
-    return Interval(low - slack, high + slack)
+                low, high = low + c * a, high + c * b
+        found.append(Interval(low - slack, high + slack))
+    return found[0], reduce(iv.hull, found[1:])
 
 
 def _blossoms(parts: int) -> Iterator[list[tuple[float, float, float]]]:

@@ -16,9 +16,9 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors import counting
-from lmdsl.model.successors.enclosing import Boxes, Stretch
-from lmdsl.model.successors.grid import Grid, met
-from lmdsl.model.successors.ranges import Judged, taken
+from lmdsl.model.successors.enclosing import StepBoxes, Stretch
+from lmdsl.model.successors.ranges import PathTables, taken
+from lmdsl.model.successors.slabs import Slabs, met
 from lmdsl.problem.problem import Problem
 
 BOXES = 2**14  # number of boxes times parts of the noise that are enclosed at a time
@@ -62,11 +62,11 @@ class Inclusion:
         self, problem: Problem, partition: Partition, sets: CellSets, allowed: Bools
     ) -> None:
         self.partition, self.path = partition, problem.judged == "path"
-        grid = Grid(problem, partition, Deadline())
+        grid = Slabs(problem, partition, Deadline())
         self.encloser, self.domains, self.controls = grid.encloser, grid.domains, grid.controls
         self.unit = partition.width / grid.pieces
         self.cuts = sum(int(n).bit_length() - 1 + CUTS for n in grid.pieces)
-        self.judged = Judged.of(sets, partition)
+        self.judged = PathTables.of(sets, partition)
         self.others, self.allowed = counting.table(~allowed, partition), allowed
         self.true_map = grid.encloser.true_map
         self.admitted, self.names = grid.admitted, grid.names
@@ -133,7 +133,7 @@ class Inclusion:
         states = [Interval(low[:, None], high[:, None]) for low, high in ends]
         controls = list(u[:, :, None])
         noise = [Interval(w.low[None], w.high[None]) for w in self.encloser.noise]
-        every = Boxes(states, controls, noise)
+        every = StepBoxes(states, controls, noise)
         lost = np.zeros((count, parts), dtype=np.uint8)
         for stretch in self.encloser.path(every, guard) if self.path else ():
             self._met(stretch, boxes.place, lost, way=True)

@@ -17,7 +17,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors import counting
-from lmdsl.model.successors.grid import Block, Grid, Span, blocks
+from lmdsl.model.successors.slabs import Slab, Slabs, Span, blocks
 from lmdsl.problem.problem import Problem
 
 PAIRS = 2**18  # number of pairs whose ranges are worked on at a time
@@ -43,7 +43,7 @@ class Ranges:
     out: Bools
 
 
-class Judged(NamedTuple):
+class PathTables(NamedTuple):
     """The tables of what decides a path, and where one may be put that is in the attractor."""
 
     avoid: counting.Table
@@ -51,7 +51,7 @@ class Judged(NamedTuple):
     absorbed: Indices  # multi-index of a cell of A, shape (d,)
 
     @classmethod
-    def of(cls, sets: CellSets, partition: Partition) -> "Judged":
+    def of(cls, sets: CellSets, partition: Partition) -> "PathTables":
         """Return the tables of the sets of a problem."""
         some = int(np.argmax(sets.attractor))
         return cls(
@@ -80,7 +80,7 @@ def enclosed(
     deadline, progress
         As for :func:`lmdsl.compile`.
     """
-    grid, judged = Grid(problem, partition, deadline), Judged.of(sets, partition)
+    grid, judged = Slabs(problem, partition, deadline), PathTables.of(sets, partition)
     cell, control = pairs
     count, parts, d = len(cell), grid.encloser.parts, partition.dimension
     kind = number_type(partition)
@@ -92,7 +92,7 @@ def enclosed(
     )
     work = list(_with_pairs(grid, cell, control))
 
-    def fill(part: tuple[Block, int, int]) -> None:
+    def fill(part: tuple[Slab, int, int]) -> None:
         block, start, end = part
         every = list(grid.stretches(block))
         admitted = grid.admits(block)
@@ -143,7 +143,7 @@ def number_type(partition: Partition) -> Any:
 
 
 def _place(
-    partition: Partition, block: Block, cell: Indices, control: NDArray[np.integer]
+    partition: Partition, block: Slab, cell: Indices, control: NDArray[np.integer]
 ) -> list[Indices]:
     """Return the place of pairs in a block, axis by axis."""
     index = partition.multi_index(cell)
@@ -160,8 +160,8 @@ def _offset(shape: tuple[int, ...], at: list[Indices]) -> Indices:
 
 
 def _with_pairs(
-    grid: Grid, cell: Indices, control: NDArray[np.integer]
-) -> Iterator[tuple[Block, int, int]]:
+    grid: Slabs, cell: Indices, control: NDArray[np.integer]
+) -> Iterator[tuple[Slab, int, int]]:
     """Yield blocks that hold pairs, and which: from the one to before the other."""
     M, at = grid.controls.shape[1], 0
     lane = cell.astype(np.int64) * M + control

@@ -46,15 +46,17 @@ class Successors:
     _deadline: Deadline
 
     @classmethod
-    def of(
+    def asked_for(
         cls,
         problem: Problem,
         partition: Partition,
         transitions: Transitions,
         deadline: Deadline,
         progress: Progress | None = None,
-    ) -> Self:
-        """Enclose the images of all pairs of some transitions."""
+    ) -> Self | None:
+        """Enclose the images of all pairs of some transitions; None where samples suffice."""
+        if problem.successors != "enclosed":
+            return None
         pointer, sets = transitions.pair_pointer, transitions.sets
         cell = sets.free[owner(pointer)]
         found = enclosed(problem, partition, sets, (cell, transitions.control), deadline, progress)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lmdsl.certificate.vectors import over_cells, padded
 from lmdsl.common.types import Bools, Floats, Policy
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.vectors import over_cells, padded
 
 IN_PLACE = 4  # number of ranges of a pass in which a cell sees the new values of its own range only
 

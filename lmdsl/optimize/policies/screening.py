@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.certificate import vectors
 from lmdsl.common.types import Bools, Floats, Policy
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.kernels import ONE, kernel
-from lmdsl.model import vectors
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.linear.policy_system import Slots, copy_row
 from lmdsl.optimize.policies import bellman

@@ -102,7 +102,6 @@ class CertificateFile(_Keys):
     beyond_gamma: dict[str, Any] | None = None
     cause: Word[Cause | None]
     claims: dict[str, bool | None]
-    sure_cells: int | None = None
     measure_residual: Bound | None
     reasons: List[str]
     iterations: int | None

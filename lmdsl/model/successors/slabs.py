@@ -20,7 +20,7 @@ from lmdsl.model.discretization import control_vectors, offsets
 from lmdsl.model.grid.axis import AxisCells
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.successors.domains import Domain, domains
-from lmdsl.model.successors.enclosing import MOST_PARTS, Boxes, Encloser, Stretch
+from lmdsl.model.successors.enclosing import MOST_PARTS, Encloser, StepBoxes, Stretch
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 
@@ -35,7 +35,7 @@ SHARE = 0.95  # share of the pairs for which that must hold
 Span = tuple[Floats, Floats]  # first and last index, before the modulus; NaN where it can be out
 
 
-class Block(NamedTuple):
+class Slab(NamedTuple):
     """A product of cells with some of the controls.
 
     Attributes
@@ -50,7 +50,7 @@ class Block(NamedTuple):
     controls: tuple[int, int]
 
 
-class Grid:
+class Slabs:
     """Encloses blocks of cells.
 
     Attributes
@@ -89,14 +89,14 @@ class Grid:
                 step = (high - low) / pieces[k]
                 start = low + np.floor(where[k] * pieces[k]) * step
                 states.append(Interval(start, start + step))
-            boxes = Boxes(states, [*control], noise)
+            boxes = StepBoxes(states, [*control], noise)
             excess = self.encloser.excess(boxes, self.guard)[: partition.dimension]
-            worst = [float(np.quantile(e, SHARE)) for e in excess]
+            worst = [_most(e) for e in excess]
             if sum(worst) <= TARGET or math.prod(pieces) >= PIECES or not np.isfinite(worst).all():
                 break
             pieces[int(np.argmax(worst))] *= 2
         if self.path:
-            far = float(np.quantile(self.encloser.speed(boxes, self.guard), SHARE))
+            far = _most(self.encloser.speed(boxes, self.guard))
             cuts = math.ceil(2 * far) if far < MOST_PARTS else MOST_PARTS
             self.encloser.arc_parts = min(max(cuts, 1), MOST_PARTS)
         return tuple(pieces)
@@ -106,7 +106,7 @@ class Grid:
         axes = self.partition.dimension + 2
         return array.reshape([-1 if k == axis else 1 for k in range(axes)])
 
-    def stretches(self, block: Block) -> Iterator[list[Span]]:
+    def stretches(self, block: Slab) -> Iterator[list[Span]]:
         """Yield by axis where the stretches of the path lie, in order, and last the images.
 
         Each array has the axes of the block, 1 long where it does not depend on one.
@@ -117,7 +117,7 @@ class Grid:
                 yield self._spans(block, stretch)
         yield self._spans(block, self.encloser.images(boxes, self.guard))
 
-    def admits(self, block: Block) -> Bools | None:
+    def admits(self, block: Slab) -> Bools | None:
         """Return on which cells the condition of admissible pairs certainly holds; None: all."""
         if self.admitted is None:
             return None
@@ -131,7 +131,7 @@ class Grid:
             surely, _ = self._joined((surely, -surely), k, block, None)
         return surely > 0
 
-    def _boxes(self, block: Block) -> Boxes:
+    def _boxes(self, block: Slab) -> StepBoxes:
         d = self.partition.dimension
         states = []
         for k, (domain, span) in enumerate(zip(self.domains, block.spans, strict=True)):
@@ -139,9 +139,9 @@ class Grid:
             states.append(Interval(*(self.along(end, k) for end in ends)))
         controls = [self.along(u[slice(*block.controls)], d) for u in self.controls]
         noise = [Interval(*(self.along(end, d + 1) for end in w)) for w in self.encloser.noise]
-        return Boxes(states, controls, noise)
+        return StepBoxes(states, controls, noise)
 
-    def _spans(self, block: Block, stretch: Stretch) -> list[Span]:
+    def _spans(self, block: Slab, stretch: Stretch) -> list[Span]:
         partition, found = self.partition, []
         for axis in range(partition.dimension):
             own = self.domains[axis].positions(*block.spans[axis]).astype(np.float64)
@@ -152,7 +152,7 @@ class Grid:
             found.append(span)
         return found
 
-    def _joined(self, span: Span, k: int, block: Block, axis: AxisCells | None) -> Span:
+    def _joined(self, span: Span, k: int, block: Slab, axis: AxisCells | None) -> Span:
         """Join the ranges of the pieces of cells along axis k, and that of the seam to the first.
 
         ``axis`` is that on which the ranges lie.
@@ -178,6 +178,12 @@ class Grid:
         )
 
 
+def _most(x: Floats) -> float:
+    """Return what all but a few are below, infinite numbers among them."""
+    ordered = np.sort(np.ravel(x))
+    return float(ordered[math.ceil(SHARE * len(ordered)) - 1])
+
+
 def _part(span: Span, axis: int, where: int | slice) -> Span:
     """Return a part of a span along an axis."""
     at = (*(slice(None),) * axis, where)
@@ -191,11 +197,10 @@ def met(stretch: Stretch, k: int, partition: Partition, own: Floats) -> Span:
     """
     axis, place = partition.axes[k], stretch.places[k]
     first, last = (axis.number(end, partition.clip) for end in place)
-    first, last = np.where(np.isnan(last), np.nan, first), np.where(np.isnan(first), np.nan, last)
-    if stretch.rises:
-        first = np.where(stretch.rises[k], np.maximum(first, own), first)
-        last = np.where(stretch.falls[k], np.minimum(last, own), last)
-    return first, last
+    if stretch.rises:  # from a state, which is not out
+        first = np.where(stretch.rises[k], np.fmax(first, own), first)
+        last = np.where(stretch.falls[k], np.fmin(last, own), last)
+    return np.where(np.isnan(last), np.nan, first), np.where(np.isnan(first), np.nan, last)
 
 
 def union(a: Span, b: Span, axis: AxisCells | None) -> Span:
@@ -207,14 +212,14 @@ def union(a: Span, b: Span, axis: AxisCells | None) -> Span:
     return np.minimum(a[0], first), np.maximum(a[1], last)
 
 
-def blocks(grid: Grid) -> Iterator[tuple[Block, int]]:
+def blocks(grid: Slabs) -> Iterator[tuple[Slab, int]]:
     """Yield blocks in the order of the cells, and the cell after their last.
 
     They are the largest products of consecutive cells that take no more boxes than fit.
     """
     shape, M = grid.partition.shape, grid.controls.shape[1]
     limit = max(LANES, min(MOST_LANES, grid.partition.size * M // SHARED))
-    small = Block(tuple((0, min(2, n)) for n in shape), (0, min(2, M)))
+    small = Slab(tuple((0, min(2, n)) for n in shape), (0, min(2, M)))
     depends = [[n > 1 for n in low.shape] for spans in grid.stretches(small) for low, _ in spans]
 
     def fits(spans: list[int], controls: int) -> bool:
@@ -234,7 +239,7 @@ def blocks(grid: Grid) -> Iterator[tuple[Block, int]]:
             end = min(start + length, shape[k])
             spans = (*((i, i + 1) for i in outer), (start, end), *rest)
             for a in range(0, M, width):
-                yield Block(spans, (a, min(a + width, M))), (number * shape[k] + end) * inner
+                yield Slab(spans, (a, min(a + width, M))), (number * shape[k] + end) * inner
 
 
 def _halved(n: int) -> Iterator[int]:
