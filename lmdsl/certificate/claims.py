@@ -19,7 +19,7 @@ stored doubles that hold in exact arithmetic (see bounds.py):
 A solver's status plays no part. A claim that almost holds is repaired or refused, never rounded.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 from lmdsl.common.records import jsonable
@@ -84,8 +84,9 @@ class Certificate:
 
     @property
     def claims(self) -> dict[str, bool | None]:
-        """Which claims hold, by name, in the order of their numbers but for the gap."""
-        return {name: getattr(self, name) for name in (*CLAIMS, "refusal", "safe")}
+        """Which claims hold, by name; None is one that is not made."""
+        kinds = (bool, bool | None)
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.type in kinds}
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; ``verified`` first, then the attributes."""

@@ -32,8 +32,8 @@ from lmdsl.formulas.truths import COMPARED, JOINED, Truth
 class Jet:
     """Values N, shape B, d derivatives, shape (d, *B), and error e, shape B; see the module.
 
-    Arithmetic with jets and numbers works as with arrays, so that a Runge-Kutta step written
-    for arrays encloses as well. Shapes B that broadcast against each other have as many axes.
+    Arithmetic with jets and numbers works as with arrays, so that a Runge-Kutta step encloses as
+    well. Shapes B that broadcast against each other have as many axes.
     """
 
     __array_ufunc__ = None  # a NumPy number times a jet is the jet's business
@@ -159,10 +159,6 @@ def _cosh(x: Interval) -> Interval:
     return iv.even(x, np.cosh, iv.loosened)
 
 
-def _acos(x: Interval) -> Interval:
-    return iv.negative(iv.increasing(lambda t: -np.arccos(t), -1.0, 1.0)(x))
-
-
 # Name of a function: its extension, and the extension of its derivative.
 Extension = Callable[[Interval], Interval]
 _SMOOTH: Final[dict[str, tuple[Extension, Extension]]] = {
@@ -174,7 +170,7 @@ _SMOOTH: Final[dict[str, tuple[Extension, Extension]]] = {
         lambda x: _one_over(_sqrt(iv.subtract(ONE, iv.square(x)))),
     ),
     "acos": (
-        _acos,
+        lambda x: iv.negative(iv.increasing(lambda t: -np.arccos(t), -1.0, 1.0)(x)),
         lambda x: iv.negative(_one_over(_sqrt(iv.subtract(ONE, iv.square(x))))),
     ),
     "atan": (iv.increasing(np.arctan), lambda x: _one_over(iv.add(ONE, iv.square(x)))),

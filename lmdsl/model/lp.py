@@ -66,12 +66,7 @@ class StabilizationLP(Frozen):
         The user's m on C, shape (n,), sum 1; zeros outside the support (all zero where no cell of
         ``measure`` lies in C).
     sure_levels
-        Where successors are enclosed, else None: see :meth:`Successors.sure_levels`.
-
-    Notes
-    -----
-    Backends solve with :attr:`solve_weight`, uniform on C: the optimal V does not depend on a
-    positive weight, while zeros in m would leave V and the controls undetermined there.
+        See :meth:`Successors.sure_levels`; None where successors are not enclosed.
     """
 
     problem: Problem
@@ -135,7 +130,10 @@ class StabilizationLP(Frozen):
 
     @property
     def solve_weight(self) -> Floats:
-        """The weight backends solve with: uniform on C, shape (n,), sum 1."""
+        """The weight backends solve with: uniform on C, shape (n,), sum 1.
+
+        V does not depend on a positive weight; zeros in m would leave it undetermined there.
+        """
         return np.full(self.n, 1.0 / max(self.n, 1))
 
     @property
@@ -155,12 +153,8 @@ class StabilizationLP(Frozen):
     def part(self, columns: Indices, inside: Indices) -> "StabilizationLP":
         """Return the model on some cells and columns; every successor must lie inside or in A.
 
-        Parameters
-        ----------
-        columns
-            Columns to keep, ascending.
-        inside
-            Positions of the cells to keep, ascending; each must keep a column.
+        ``columns`` and ``inside``, the positions of the cells, are ascending; each of these cells
+        must keep a column.
         """
         columns = inputs.indices(columns, self.K, "columns", "columns")
         inside = inputs.indices(inside, self.n, "inside", "positions")

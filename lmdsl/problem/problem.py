@@ -60,8 +60,7 @@ class Problem(Declared):
     sampling
         Sample points within a cell for Ulam's method.
     successors
-        ``sampled`` (default), or ``enclosed``: a pair survives only if all that the image of the
-        whole cell can meet lies in C u A, so that no run of the map is lost.
+        ``sampled`` (default), or ``enclosed``: a pair survives by all that its whole cell can meet.
     gamma
         Geometric weight of the cost, sum of gamma^n G(x_n, u_n).
     discount

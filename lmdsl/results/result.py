@@ -66,8 +66,7 @@ class Result(Summary):
     control_vectors
         Shape (M, p).
     sure_levels
-        Shape (N,), int32, where successors are enclosed, else None: in how many steps some
-        controller surely enters A from all of the cell; 0 on A, -1 where none is known to.
+        Shape (N,), int32, or None: in how many steps some controller surely enters A, -1: unknown.
     iterations
         Iterations in the backend's own sense.
     log
@@ -111,16 +110,6 @@ class Result(Summary):
         return None if self.attractor_cells is None else Coverage.of(self.cell_status)
 
     @property
-    def sure_cells(self) -> int | None:
-        """Number of cells outside A with a sure level; None unless successors are enclosed."""
-        return None if self.sure_levels is None else int((self.sure_levels > 0).sum())
-
-    @property
-    def claims(self) -> dict[str, bool | None]:
-        """Which claims of the certificate hold, by name; None is one that is not made."""
-        return self.certificate.claims
-
-    @property
     def reward(self) -> float | None:
         """The mean reward by m that the policy earns at least; None where costs are minimised."""
         missed = self._missed
@@ -149,8 +138,7 @@ class Result(Summary):
     def ended_by_discount(self) -> float | None:
         """The share of runs that the discount ends before they reach A; None unless gamma is 1.
 
-        It is (1 - b) sum(mu): the Lyapunov measure counts the visits of each cell, and every visit
-        is the last one with probability 1 - b.
+        It is (1 - b) sum(mu): mu counts visits, each the last one with probability 1 - b.
         """
         b = self.problem.discount
         if b is None or self.gamma != 1 or not self.certificate.measure:

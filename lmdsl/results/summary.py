@@ -161,12 +161,14 @@ class Summary(Frozen):
     @property
     def sure_cells(self) -> int | None:
         """Number of cells from all of which some controller surely enters A; None: not known."""
-        return None
+        levels = getattr(self, "sure_levels", None)
+        return None if levels is None else int((levels > 0).sum())
 
     @property
     def claims(self) -> dict[str, bool | None]:
-        """Which claims of the certificate hold; none before there is one."""
-        return {}
+        """Which claims of the certificate hold, by name; None is one that is not made."""
+        proof = getattr(self, "certificate", None)
+        return {} if proof is None else dict(proof.claims)
 
     @property
     def beyond_gamma(self) -> Area | None:

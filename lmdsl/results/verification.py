@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.certificate.judge import exact_verdict, verdict
@@ -165,8 +164,6 @@ def verify(
         notes.append("the recompiled model differs from the stored one; claims are judged on it")
     if not np.array_equal(lp.cell_status, result.cell_status):
         reasons.append("cell_status differs from the recompiled model")
-    if not _same(lp.sure_levels, result.sure_levels):
-        reasons.append("sure_levels differ from the recompiled model")
     if result.status == Status.NOT_STABILIZABLE:
         certificate = _judge_refusal(lp, result, reasons, judge)
     else:
@@ -182,10 +179,6 @@ def verify(
     )
     system = result.problem.system
     return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
-
-
-def _same(found: NDArray[Any] | None, stored: NDArray[Any] | None) -> bool:
-    return found is None if stored is None else found is not None and np.array_equal(found, stored)
 
 
 def _restricted(

@@ -46,6 +46,8 @@ def differences(
     ``whole`` is the recompiled model, ``lp`` the part of it that a restricted result speaks of.
     """
     reasons = [*_counts(lp, result), *_numbers(result, found), *_outside(lp, result)]
+    if result.sure_levels is not None and not np.array_equal(result.sure_levels, whole.sure_levels):
+        reasons.append("sure_levels differ from the recompiled model")
     claims = certificate.claims
     for name in (*(claim.name for claim in CLAIMS), "safe"):
         if claims.get(name) is not getattr(found, name):
