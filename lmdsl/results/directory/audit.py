@@ -46,7 +46,8 @@ def differences(
     ``whole`` is the recompiled model, ``lp`` the part of it that a restricted result speaks of.
     """
     reasons = [*_counts(lp, result), *_numbers(result, found), *_outside(lp, result)]
-    if result.sure_levels is not None and not np.array_equal(result.sure_levels, whole.sure_levels):
+    sure = whole.sure_levels
+    if sure is not None and not np.array_equal(np.asarray(result.sure_levels), sure):
         reasons.append("sure_levels differ from the recompiled model")
     claims = certificate.claims
     for name in (*(claim.name for claim in CLAIMS), "safe"):
