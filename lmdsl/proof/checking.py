@@ -18,8 +18,8 @@ from lmdsl.model.grid.boxes import named
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof.cover import Cover, node_bytes
 from lmdsl.proof.images.pieces import DEEPEST
+from lmdsl.proof.loop import Loop
 from lmdsl.proof.prover import Prover
-from lmdsl.proof.proving import Loop
 from lmdsl.proof.search import (
     ARRIVES,
     EVERY,

@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 
 from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Floats
+from lmdsl.proof.loop import Loop
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
 
+_WITNESSES = {
+    "lost": "runs are lost", "stays": "runs stay elsewhere", "undecided": "it is undecided",
+}  # fmt: skip
 TARGET = 0.999  # share of the volume that is asked for where nothing else is
 
 
@@ -51,6 +55,9 @@ class Proof(Frozen):
         where neither is known.
     target
         The share asked for.
+    witnesses
+        The middle of the largest box that is ``lost``, ``stays`` or is ``undecided``; None
+        where there is none. ``closed_loop.path(x, steps, as_compiled=True)`` follows it.
     cell, split, place
         The boxes: part ``place`` of 2^``split`` equal parts of a cell, by axis; (B,) and (B, d).
     kind
@@ -72,6 +79,7 @@ class Proof(Frozen):
     seconds: float
     holds: bool | None
     target: float
+    witnesses: dict[str, tuple[float, ...] | None]
     cell: NDArray[np.int64]
     split: NDArray[np.uint8]
     place: NDArray[np.uint32]
@@ -83,24 +91,34 @@ class Proof(Frozen):
 
     @classmethod
     def of(
-        cls, arrays: dict[str, NDArray[Any]], cells: int, *, seconds: float, holds: bool | None,
-        target: float, to_stay: bool,
+        cls, arrays: dict[str, NDArray[Any]], loop: Loop, *, seconds: float, holds: bool | None,
+        target: float,
     ) -> Self:  # fmt: skip
-        """Return the proof that boxes are; ``cells`` is the number of cells of C."""
+        """Return the proof that boxes are."""
         kind, volume = arrays["class"], volumes(arrays["split"])
 
         def share(state: int) -> float:
-            return math.fsum(volume[kind == state]) / max(cells, 1)
+            return math.fsum(volume[kind == state]) / max(loop.cells, 1)
+
+        def middle(state: int) -> tuple[float, ...] | None:
+            largest = int(np.argmax(np.where(kind == state, volume, -1.0))) if len(kind) else 0
+            if not len(kind) or kind[largest] != state:
+                return None
+            (index,) = np.stack(loop.partition.multi_index(arrays["cell"][[largest]]), axis=-1)
+            part = (arrays["place"][largest] + 0.5) / 2.0 ** arrays["split"][largest]
+            x = loop.partition.low + (index + part) * loop.partition.width
+            return tuple(x.tolist())
 
         arriving = kind == ARRIVES
         weight, cost, steps = volume[arriving], None, None
         if arriving.any():
             low, high = (_mean(arrays[name][arriving], weight) for name in ("lower", "cost"))
             cost, steps = (low, high), int(arrays["level"][arriving].max())
+        witnesses = {"lost": middle(LOST), "stays": middle(STAYS), "undecided": middle(UNDECIDED)}
         return cls(
             share(ARRIVES), share(LOST), share(STAYS), share(UNDECIDED), steps, cost, len(kind),
-            seconds, holds, target, arrays["cell"], arrays["split"], arrays["place"], kind,
-            arrays["level"], arrays["cost"], arrays["lower"], to_stay,
+            seconds, holds, target, witnesses, arrays["cell"], arrays["split"], arrays["place"],
+            kind, arrays["level"], arrays["cost"], arrays["lower"], loop.to_stay,
         )  # fmt: skip
 
     @property
@@ -127,17 +145,8 @@ class Proof(Frozen):
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
-        names = (
-            "arrives",
-            "lost",
-            "stays",
-            "undecided",
-            "steps",
-            "cost",
-            "boxes",
-            "seconds",
-            "holds",
-        )
+        names = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes", "seconds",
+                 "holds", "witnesses")  # fmt: skip
         return {name: jsonable(getattr(self, name)) for name in names}
 
     def text(self) -> str:
@@ -153,6 +162,11 @@ class Proof(Frozen):
                 f"  what arrives does so in at most {self.steps} steps; its average cost lies "
                 f"between {low:.6g} and {high:.6g}"
             )
+        lines += [
+            f"  {words}, for example from ({', '.join(f'{x:.9g}' for x in found)})"
+            for name, words in _WITNESSES.items()
+            if (found := self.witnesses[name]) is not None
+        ]
         held = {True: "proved", False: "refuted by a run", None: "not proved"}[self.holds]
         lines.append(f"  that what is in A stays there is {held}")
         lines.append(f"  {self.boxes:,} boxes, {self.seconds:.1f} s; target {self.target:.6g} is "

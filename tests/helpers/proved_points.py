@@ -83,9 +83,8 @@ def proof_of(path):
     stored = archive.read(path)
     result, said = stored.result, stored.certificate.proof
     arrays = proved.read(path, result, said)
-    cells = int((result.cell_status == 1).sum())
-    return result, Proof.of(arrays, cells, seconds=said.seconds, holds=said.holds,
-                            target=said.target, to_stay=False)  # fmt: skip
+    return result, Proof.of(arrays, proved.loop_of(result), seconds=said.seconds, holds=said.holds,
+                            target=said.target)  # fmt: skip
 
 
 if __name__ == "__main__":

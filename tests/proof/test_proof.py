@@ -71,6 +71,12 @@ def test_what_samples_do_not_see_is_found(formula, lost, stays):
     assert proof.arrives == pytest.approx(1 - lost - stays, abs=1e-3)
     assert exceptions(result, proof, 4000) == {"arrives": 0, "lost": 0, "stays": 0}
     assert not any(np.isnan(proof.cost))
+    for kind, outcome in (("lost", 1), ("stays", 2)):
+        if proof.witnesses[kind] is not None:
+            x = np.array(proof.witnesses[kind])
+            run = result.closed_loop.run(x[None], 50, np.random.default_rng(0))
+            assert run.outcome[0] == outcome
+    assert (proof.witnesses["lost"] is None) == (lost == 0)
 
 
 def test_a_state_at_the_end_of_a_circle_belongs_to_its_first_cell():

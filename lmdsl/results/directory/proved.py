@@ -14,7 +14,7 @@ from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof import checking
-from lmdsl.proof.proving import Loop
+from lmdsl.proof.loop import Loop
 from lmdsl.proof.proving import prove as proved
 from lmdsl.proof.record import BOX, Proof, expected
 from lmdsl.results.directory import reading, writing
@@ -142,14 +142,11 @@ def _differences(
     if not _complete(result):
         return ["the proof is of no controller: control_index lacks a cell of C"]
     found = read(path, result, said)
-    reasons = checking.faults(loop_of(result), found, guard)
+    loop = loop_of(result)
+    reasons = checking.faults(loop, found, guard)
     if reasons:
         return reasons
-    cells = int((result.cell_status == 1).sum())
-    proof = Proof.of(
-        found, cells, seconds=said.seconds, holds=holds(result), target=said.target,
-        to_stay=result.problem.attractor.empty,
-    )  # fmt: skip
+    proof = Proof.of(found, loop, seconds=said.seconds, holds=holds(result), target=said.target)
     if said.sha256 != proof.sha256:
         reasons.append("proof.sha256 is not that of the boxes")
     for name in (*SHARES, "holds"):
