@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.proof.search import ARRIVES, LOST, UNDECIDED
+from lmdsl.proof.search import ARRIVES, LOST, UNDECIDED, measure
 
 
 class Tree(NamedTuple):
@@ -114,7 +114,9 @@ class Cover:
 
     def volume(self, nodes: Indices) -> Floats:
         """Return volumes of nodes, in cells."""
-        return np.asarray(2.0 ** -self.tree.split[nodes].sum(axis=1, dtype=np.float64))
+        volume = np.empty(len(nodes))
+        measure(self.tree, nodes, volume)
+        return volume
 
     def grow(self, more: int) -> None:
         """Make room for nodes."""

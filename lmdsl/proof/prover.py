@@ -14,7 +14,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import settling
 from lmdsl.proof.cover import Cover, node_bytes
 from lmdsl.proof.images.seen import BoxImages, deep
-from lmdsl.proof.search import UNDECIDED, Search
+from lmdsl.proof.search import UNDECIDED, Search, tally
 
 DEEP_FIRST = 0.75  # by how many halvings of its volume a score counts half as much
 EQUAL = 0.5  # share of the best score that is as good
@@ -108,11 +108,8 @@ class Prover:
 
     def shares(self) -> Floats:
         """Return the shares of the volume of C by state."""
-        cover = self.cover
-        leaves = cover.leaves()
-        inside = cover.tree.images[leaves] > 0
-        leaves = leaves[inside]
-        volume = np.bincount(cover.tree.state[leaves], cover.volume(leaves), minlength=4)
+        volume = np.zeros(4)
+        tally(self.cover.tree, self.cover.count, volume)
         return np.asarray(volume / max(self.volume, 1.0))
 
     def chosen(self, leaves: Indices) -> Indices:
@@ -122,8 +119,7 @@ class Prover:
         score, waiting = np.zeros(count), np.zeros(count, dtype=np.int32)
         order = np.zeros(len(leaves), dtype=np.int64)
         settling.worth(tree, leaves, volume, order, score, waiting)
-        depth = tree.split[leaves].sum(axis=1, dtype=np.float64)
-        worth = score[leaves] * 2.0 ** (-DEEP_FIRST * depth)
+        worth = score[leaves] * volume**DEEP_FIRST
         waits = tree.waits[leaves]
         smaller = self.cover.volume(np.maximum(waits, 0)) < volume
         circle = waiting[leaves]

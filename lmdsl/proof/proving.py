@@ -53,15 +53,17 @@ def prove(
 
 
 def boxes(prover: Prover) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a proof: the leaves by cell, levels and bounds made exact for each."""
+    """Return the arrays of a proof, the leaves by cell, once bounds are tightened.
+
+    So are levels of what arrives; those of what is lost are here.
+    """
     cover = prover.cover
     tree = cover.tree
     leaves = cover.leaves()
     leaves = leaves[tree.images[leaves] > 0]
-    for decided in (ARRIVES, LOST):
-        some = leaves[tree.state[leaves] == decided]
-        some = some[np.argsort(tree.level[some], kind="stable")]
-        settling.refine(prover.search, some, prover.factor, np.zeros(len(some)))
+    lost = leaves[tree.state[leaves] == LOST]
+    lost = lost[np.argsort(tree.level[lost], kind="stable")]
+    settling.refine(prover.search, lost, prover.factor, np.zeros(len(lost)))
     leaves = leaves[np.argsort(tree.cell[leaves], kind="stable")]
     state = tree.state[leaves]
     arrives, ends = state == ARRIVES, (state == ARRIVES) | (state == LOST)

@@ -69,6 +69,30 @@ class Search(NamedTuple):
 
 
 @kernel
+def measure(tree, nodes, volume):  # type: ignore[no-untyped-def]
+    """Fill in the volumes of nodes, in cells."""
+    for j in range(len(nodes)):
+        volume[j] = 0.5 ** depth(tree, nodes[j])
+
+
+@kernel
+def depth(tree, n):  # type: ignore[no-untyped-def]
+    """Return by how many bisections a node is made."""
+    found = np.int64(0)
+    for k in range(tree.split.shape[1]):
+        found += np.int64(tree.split[n, k])
+    return found
+
+
+@kernel
+def tally(tree, count, volume):  # type: ignore[no-untyped-def]
+    """Add the volumes of the leaves of C by state, shape (4,)."""
+    for n in range(count):
+        if tree.child[n] < 0 and tree.images[n] > 0:
+            volume[tree.state[n]] += 0.5 ** depth(tree, n)
+
+
+@kernel
 def meet(search, b, until):  # type: ignore[no-untyped-def]
     """Return what the images of a node meet; at once, when an undecided leaf is, unless EVERY."""
     tree = search.tree

@@ -19,6 +19,7 @@ from lmdsl.proof.search import (
     MEETS_UNDECIDED,
     STAYS,
     UNDECIDED,
+    depth,
     meet,
 )
 
@@ -193,25 +194,17 @@ def _circles(tree, leaves, score, waiting):  # type: ignore[no-untyped-def]
         total, shallow, n = 0.0, np.int64(2**31), b
         while True:
             total += score[n]
-            shallow = min(shallow, _depth(tree, n))
+            shallow = min(shallow, depth(tree, n))
             n = tree.waits[n]
             if n == b:
                 break
         while True:
-            waiting[n] = LARGEST if _depth(tree, n) == shallow else OTHER
+            waiting[n] = LARGEST if depth(tree, n) == shallow else OTHER
             score[n] = total
             n = tree.waits[n]
             if n == b:
                 break
     return circles
-
-
-@kernel
-def _depth(tree, n):  # type: ignore[no-untyped-def]
-    depth = np.int64(0)
-    for k in range(tree.split.shape[1]):
-        depth += np.int64(tree.split[n, k])
-    return depth
 
 
 @kernel

@@ -1,5 +1,6 @@
 """Tighter bounds of the cost: boxes that arrive are bisected where their bounds are loose."""
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -22,6 +23,7 @@ def tighten(
     """Bisect arriving boxes until their mean bounds are close, or there are enough boxes."""
     cover = prover.cover
     whole = np.zeros(0, dtype=np.int64)  # leaves whose halves are not proved to arrive as soon
+    began = time.monotonic()
     while True:
         leaves = arriving(prover)
         torn = np.zeros(len(leaves))
@@ -32,7 +34,9 @@ def tighten(
         gap = (high - low) / high if 0 < high < np.inf else 0.0
         if progress is not None:
             progress("tighten", min(1.0, CLOSE / max(gap, CLOSE)))
-        if gap <= CLOSE or enough(len(leaves)) or deadline() or not prover.room(len(leaves)):
+        began, taken = time.monotonic(), time.monotonic() - began
+        late = deadline.left is not None and deadline.left < taken
+        if gap <= CLOSE or enough(len(leaves)) or late or not prover.room(len(leaves)):
             break
         torn[np.isin(leaves, whole)] = 0.0
         some = _loose(prover, leaves, volume, torn)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lmdsl.common.types import Floats
-from lmdsl.formulas.compiled.ends import down, up
+from lmdsl.formulas.compiled.ends import LEAST, UNIT, down, up
 from lmdsl.formulas.compiled.machine import BLOCK, registers, run
 from lmdsl.machine.kernels import kernel
 from lmdsl.proof.images.tapes import Step, Tapes
@@ -52,20 +52,21 @@ class Enclosed(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Registers of the tapes of a step, and the sides of boxes about their centres."""
+    """Registers of the tapes of a step, sides of boxes about their centres, and what is found."""
 
     box: Floats
     centre: Floats
     end_box: Floats
     end_centre: Floats
     away: Floats
+    found: Floats
 
 
 def rows(step: Step) -> Room:
     """Return registers for a step; threads need their own."""
     return Room(
         registers(step.advance.box), registers(step.advance.centre), registers(step.end.box),
-        registers(step.end.centre), np.zeros((step.sizes[0], 2, BLOCK)),
+        registers(step.end.centre), np.zeros((step.sizes[0], 2, BLOCK)), np.zeros((2, BLOCK)),
     )  # fmt: skip
 
 
@@ -87,9 +88,9 @@ def ranges(step: Step, tapes: Tapes, given: Given) -> tuple[Floats, Floats]:
     shape = (len(given.low), len(tapes.middle))
     low, high = np.empty(shape), np.empty(shape)
     if shape[1]:
-        sides = np.zeros((step.sizes[0], 2, BLOCK))
-        box, centre = registers(tapes.box), registers(tapes.centre)
-        _ranges(tapes, given, step.sizes, (box, centre, sides), (low, high))
+        sides, row = np.zeros((step.sizes[0], 2, BLOCK)), np.zeros((2, BLOCK))
+        work = (registers(tapes.box), registers(tapes.centre), sides, row)
+        _ranges(tapes, given, step.sizes, work, (low, high))
     return low, high
 
 
@@ -97,49 +98,65 @@ def ranges(step: Step, tapes: Tapes, given: Given) -> tuple[Floats, Floats]:
 def _load(rows, first, given, sizes, at, seed):  # type: ignore[no-untyped-def]
     """Put the boxes from ``at`` on into registers, components and their slopes at the start."""
     d, m, p, r = sizes
-    for i in range(BLOCK):
-        b = min(at + i, len(given.low) - 1)
-        for k in range(d):
-            rows[k, 0, i], rows[k, 1, i] = given.low[b, k], given.high[b, k]
-        for j in range(p):
-            rows[first + j, 0, i] = rows[first + j, 1, i] = given.control[b, j]
-        for j in range(r):
-            rows[first + p + j, 0, i] = given.least[b, j]
-            rows[first + p + j, 1, i] = given.most[b, j]
-        if seed:
-            for j in range(d, m):
-                rows[j, 0, i] = rows[j, 1, i] = 0.0
-            for j in range(m * (d + 1)):
-                x = 1.0 if (j < m * d) & (j % d == j // d) else 0.0
-                rows[m + j, 0, i] = rows[m + j, 1, i] = x
+    count = min(BLOCK, len(given.low) - at)
+    for k in range(d):
+        for i in range(count):
+            rows[k, 0, i], rows[k, 1, i] = given.low[at + i, k], given.high[at + i, k]
+    for j in range(p):
+        for i in range(count):
+            rows[first + j, 0, i] = rows[first + j, 1, i] = given.control[at + i, j]
+    for j in range(r):
+        for i in range(count):
+            rows[first + p + j, 0, i] = given.least[at + i, j]
+            rows[first + p + j, 1, i] = given.most[at + i, j]
+    if seed:
+        for j in range(d, m * (d + 2)):
+            x = 1.0 if (j >= m) & (j < m + m * d) & ((j - m) % d == (j - m) // d) else 0.0
+            for i in range(BLOCK):
+                rows[j, 0, i] = rows[j, 1, i] = x
 
 
 @kernel
-def _centre(rows, away, given, d, at):  # type: ignore[no-untyped-def]
+def _centre(box, rows, away):  # type: ignore[no-untyped-def]
     """Put centres in place of boxes, and fill in the sides about them."""
-    for i in range(BLOCK):
-        b = min(at + i, len(given.low) - 1)
-        for k in range(d):
-            low, high = given.low[b, k], given.high[b, k]
-            c = min(max(0.5 * low + 0.5 * high, low), high)
+    for k in range(len(away)):
+        for i in range(BLOCK):
+            low, high = box[k, 0, i], box[k, 1, i]
+            c = 0.5 * low + 0.5 * high
+            c = low if c < low else high if c > high else c
             rows[k, 0, i] = rows[k, 1, i] = c
-            away[k, 0, i], away[k, 1, i] = down(low - c), up(high - c)
+            x, y = low - c, high - c
+            away[k, 0, i], away[k, 1, i] = x - abs(x) * UNIT, y + abs(y) * UNIT
 
 
 @kernel
-def mean_value(rows, out, middle, away, i):  # type: ignore[no-untyped-def]
-    """Return what contains all values computed of an output on box i of the block."""
-    value, error = out[0], rows[out[1], 1, i]
-    low, high = down(middle[0, i] - error), up(middle[1, i] + error)
+def mean_values(t, rows, out, middle, away):  # type: ignore[no-untyped-def]
+    """Fill in what contains all values computed of an output on the boxes of a block."""
+    value, error = rows[out[0]], rows[out[1]]
+    for i in range(BLOCK):
+        x, y = middle[0, i] - error[1, i], middle[1, i] + error[1, i]
+        t[0, i], t[1, i] = x - (abs(x) * UNIT + LEAST), y + (abs(y) * UNIT + LEAST)
     for k in range(len(away)):
-        a, b = rows[out[2 + k], 0, i], rows[out[2 + k], 1, i]
-        x, y = away[k, 0, i], away[k, 1, i]
-        p, q, r, s = a * x, a * y, b * x, b * y
-        low = down(low + down(min(min(p, q), min(r, s))))
-        high = up(high + up(max(max(p, q), max(r, s))))
-    if not high - low < np.inf:
-        return rows[value, 0, i], rows[value, 1, i]
-    return max(low, rows[value, 0, i]), min(high, rows[value, 1, i])
+        if out[2 + k] < 0:
+            continue  # no slope
+        slope, side = rows[out[2 + k]], away[k]
+        for i in range(BLOCK):
+            p, q = slope[0, i] * side[0, i], slope[0, i] * side[1, i]
+            r, s = slope[1, i] * side[0, i], slope[1, i] * side[1, i]
+            p, q = p if p < q else q, q if p < q else p
+            r, s = r if r < s else s, s if r < s else r
+            x, y = p if p < r else r, s if q < s else q
+            x, y = x - (abs(x) * UNIT + LEAST), y + (abs(y) * UNIT + LEAST)
+            sound = (slope[1, i] - slope[0, i]) + (y - x) < np.inf
+            x, y = t[0, i] + x, t[1, i] + y
+            x, y = x - abs(x) * UNIT, y + abs(y) * UNIT
+            t[0, i], t[1, i] = x if sound else -np.inf, y if sound else np.inf
+    for i in range(BLOCK):
+        x, y = t[0, i], t[1, i]
+        sound = y - x < np.inf
+        x, y = x if sound else -np.inf, y if sound else np.inf
+        t[0, i] = x if x > value[0, i] else value[0, i]
+        t[1, i] = y if y < value[1, i] else value[1, i]
 
 
 @kernel
@@ -152,13 +169,11 @@ def _extend(arcs, b, s, k, low, high, fresh):  # type: ignore[no-untyped-def]
 @kernel
 def _points(arcs, tapes, held, at, s, row):  # type: ignore[no-untyped-def]
     """Extend arc s by the control points that are outputs from ``row`` on."""
-    rows, middle, away = held
-    d = len(away)
-    for i in range(min(BLOCK, len(arcs) - at)):
-        for k in range(d):
-            out = tapes.out[row + k]
-            low, high = mean_value(rows, out, middle[tapes.middle[row + k]], away, i)
-            _extend(arcs, at + i, s, k, low, high, False)
+    rows, middle, away, t = held
+    for k in range(len(away)):
+        mean_values(t, rows, tapes.out[row + k], middle[tapes.middle[row + k]], away)
+        for i in range(min(BLOCK, len(arcs) - at)):
+            _extend(arcs, at + i, s, k, t[0, i], t[1, i], False)
 
 
 @kernel
@@ -193,20 +208,25 @@ def _start(arcs, given, at, s):  # type: ignore[no-untyped-def]
 @kernel
 def _knot(found, step, held, at, s):  # type: ignore[no-untyped-def]
     """Note the end of substep s: of the arc before it and, where there is one, the next."""
-    rows, middle, away = held
-    tapes, d = step.advance, len(away)
-    for i in range(min(BLOCK, len(found.low) - at)):
-        for k in range(len(found.low[0])):
-            out = tapes.out[k]
-            low, high = mean_value(rows, out, middle[tapes.middle[k]], away, i)
-            found.low[at + i, k], found.high[at + i, k] = low, high
-            for j in range(d):
-                a, b = rows[out[2 + j], 0, i], rows[out[2 + j], 1, i]
-                found.stretch[at + i, k, j] = max(abs(a), abs(b)) * (away[j, 1, i] - away[j, 0, i])
-            if step.path & (k < d):
-                _extend(found.arcs, at + i, s, k, low, high, False)
+    rows, middle, away, t = held
+    tapes, d, count = step.advance, len(away), min(BLOCK, len(found.low) - at)
+    for k in range(len(found.low[0])):
+        out = tapes.out[k]
+        mean_values(t, rows, out, middle[tapes.middle[k]], away)
+        for i in range(count):
+            found.low[at + i, k], found.high[at + i, k] = t[0, i], t[1, i]
+        if step.path and k < d:
+            for i in range(count):
+                _extend(found.arcs, at + i, s, k, t[0, i], t[1, i], False)
                 if s + 1 < step.substeps:
-                    _extend(found.arcs, at + i, s + 1, k, low, high, True)
+                    _extend(found.arcs, at + i, s + 1, k, t[0, i], t[1, i], True)
+        for j in range(d):
+            for i in range(count if s + 1 == step.substeps else 0):
+                most = 0.0
+                if out[2 + j] >= 0:
+                    a, b = abs(rows[out[2 + j], 0, i]), abs(rows[out[2 + j], 1, i])
+                    most = a if a > b else b
+                found.stretch[at + i, k, j] = most * (away[j, 1, i] - away[j, 0, i])
 
 
 @kernel
@@ -221,11 +241,11 @@ def _pass(source, target, count):  # type: ignore[no-untyped-def]
 def _enclose(step, given, held, found):  # type: ignore[no-untyped-def]
     d, m, p, r = step.sizes
     first = m * (2 + d)
-    work = (held.box, held.centre, held.away)
+    work = (held.box, held.centre, held.away, held.found)
     for at in range(0, len(given.low), BLOCK):
-        _load(held.box, first, given, step.sizes, at, True)
-        _load(held.centre, first, given, step.sizes, at, True)
-        _centre(held.centre, held.away, given, d, at)
+        _load(held.box, first, given, step.sizes, at, step.substeps > 1)
+        _load(held.centre, first, given, step.sizes, at, step.substeps > 1)
+        _centre(held.box, held.centre, held.away)
         if step.path:
             _start(found.arcs, given, at, 0)
         for s in range(step.substeps):
@@ -246,7 +266,7 @@ def _enclose(step, given, held, found):  # type: ignore[no-untyped-def]
             _pass(held.centre, held.end_centre, first + p + r)
             run(step.end.box, held.end_box)
             run(step.end.centre, held.end_centre)
-            last = (held.end_box, held.end_centre, held.away)
+            last = (held.end_box, held.end_centre, held.away, held.found)
             _points(found.arcs, step.end, last, at, step.substeps - 1, 0)
             if step.substeps == 1:
                 _ways(found.way, step.end, held.end_box, at, d, 2)
@@ -254,19 +274,17 @@ def _enclose(step, given, held, found):  # type: ignore[no-untyped-def]
 
 @kernel
 def _ranges(tapes, given, sizes, work, found):  # type: ignore[no-untyped-def]
-    box, centre, away = work
+    box, centre, away, t = work
     low, high = found
-    d, m = sizes[0], sizes[0]
-    plain = (d, m, sizes[2], sizes[3])
+    d = sizes[0]
+    plain = (d, d, sizes[2], sizes[3])
     for at in range(0, len(low), BLOCK):
-        _load(box, m * (2 + d), given, plain, at, False)
-        _load(centre, m * (2 + d), given, plain, at, False)
-        _centre(centre, away, given, d, at)
+        _load(box, d * (2 + d), given, plain, at, False)
+        _load(centre, d * (2 + d), given, plain, at, False)
+        _centre(box, centre, away)
         run(tapes.box, box)
         run(tapes.centre, centre)
-        for i in range(min(BLOCK, len(low) - at)):
-            for k in range(low.shape[1]):
-                found_low, found_high = mean_value(
-                    box, tapes.out[k], centre[tapes.middle[k]], away, i
-                )
-                low[at + i, k], high[at + i, k] = found_low, found_high
+        for k in range(low.shape[1]):
+            mean_values(t, box, tapes.out[k], centre[tapes.middle[k]], away)
+            for i in range(min(BLOCK, len(low) - at)):
+                low[at + i, k], high[at + i, k] = t[0, i], t[1, i]

@@ -29,7 +29,7 @@ class Tapes(NamedTuple):
     box, centre
         The tapes.
     out
-        Registers of ``box``, shape (outputs, 2 + d): value, error, slopes.
+        Registers of ``box``, shape (outputs, 2 + d): value, error, slopes (-1: no slope).
     middle
         Registers of ``centre``, shape (outputs,).
     into
@@ -195,6 +195,8 @@ class _Maker:
                 goes |= {i: jet.value, m + m * d + i: error}
                 goes |= {m + i * d + k: p for k, p in enumerate(slope)}
         box, out = writer.finish(values, goes)
+        slopes = [p for jet in boxed for p in (ZERO, ZERO, *jet.slope)]
+        out = [-1 if p is None else register for p, register in zip(slopes, out, strict=True)]
         other = centred[0].writer if centred else Writer(0)
         goes = {i: jet.value for i, jet in enumerate(centred[:into])}
         centre, middle = other.finish([jet.value for jet in centred], goes)
