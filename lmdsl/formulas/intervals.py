@@ -105,13 +105,19 @@ def intersection(a: Interval, b: Interval) -> Interval:
 
 
 def add(a: Interval, b: Interval) -> Interval:
-    """Return a + b."""
-    return _summed(a.low + b.low, a.high + b.high)
+    """Return a + b; a + 0 is exact."""
+    return _exact(a, b, _exact(b, a, _summed(a.low + b.low, a.high + b.high)))
 
 
 def subtract(a: Interval, b: Interval) -> Interval:
-    """Return a - b."""
-    return _summed(a.low - b.high, a.high - b.low)
+    """Return a - b; a - 0 is exact."""
+    return _exact(a, b, _summed(a.low - b.high, a.high - b.low))
+
+
+def _exact(a: Interval, b: Interval, value: Interval) -> Interval:
+    """Return a where b is 0, else a value: what does not move stays in its cell."""
+    zero = _is_zero(b)
+    return either(zero, a, value) if np.any(zero) else value
 
 
 def _summed(low: Any, high: Any) -> Interval:
@@ -172,7 +178,7 @@ def increasing(
     def extension(a: Interval) -> Interval:
         inside = (a.low >= low) & (a.high <= high)
         value = loosened(function(a.low), function(a.high))
-        return either(inside, value, whole(value.low))
+        return either(inside, _rooted(a, function, value), whole(value.low))
 
     return extension
 
@@ -205,13 +211,20 @@ def _wave(a: Interval, function: Callable[[Any], Any], top: float) -> Interval:
     value = loosened(np.minimum(*ends), np.maximum(*ends))
     low = np.where(_turns(a, top - math.pi, 2 * math.pi), -_TOP, value.low)
     high = np.where(_turns(a, top, 2 * math.pi), _TOP, value.high)
-    return Interval(np.maximum(low, -_TOP), np.minimum(high, _TOP))
+    return _rooted(a, function, Interval(np.maximum(low, -_TOP), np.minimum(high, _TOP)))
 
 
 def tangent(a: Interval) -> Interval:
     """Return tan(a); the whole line where a pole may lie inside."""
-    value = loosened(np.tan(a.low), np.tan(a.high))
+    value = _rooted(a, np.tan, loosened(np.tan(a.low), np.tan(a.high)))
     return either(_turns(a, math.pi / 2, math.pi), whole(value.low), value)
+
+
+def _rooted(a: Interval, function: Callable[[Any], Any], value: Interval) -> Interval:
+    """Return 0 where a function is asked for f(0) = 0, which is exact; else a value."""
+    zero = _is_zero(a)
+    root = np.any(zero) and function(0.0) == 0.0
+    return either(zero, Interval.point(0.0), value) if root else value
 
 
 def absolute(a: Interval) -> Interval:

@@ -1,0 +1,133 @@
+"""Enclosed successors on published problems: no run is lost, and more cells are sure.
+
+The other side is what symbolic tools do, written here in plain NumPy: the centre of a cell is
+integrated, a growth bound is put around it, and the cells that this box meets are all reached
+(edges are met by both cells: those tools leave it to rounding which).
+"""
+
+import numpy as np
+import pytest
+from problems import made
+from test_corners import SMALL, WALLS, lost_and_reached, maze, slope
+
+import lmdsl as lm
+
+PLANNING = [(1.0, 1.2, 0.0, 9.0), (2.2, 2.4, 0.0, 5.0), (2.2, 2.4, 6.0, 10.0)]
+
+
+def winning(data, status):
+    """Return the cells outside A that a growth bound wins, as the car of G. Reissig et al. does."""
+    boxes = list(data["state_box"].values())
+    low, high = (np.array([box[end] for box in boxes]) for end in ("low", "high"))
+    cells = np.array([box["cells"] for box in boxes])
+    width, shape = (high - low) / cells, tuple(cells)
+    centre = [low[k] + (np.arange(n) + 0.5) * width[k] for k, n in enumerate(cells)]
+    mesh = np.stack([x.ravel() for x in np.meshgrid(*centre, indexing="ij")])
+    target, unsafe = (status == 0).reshape(shape), (status == 5).reshape(shape)
+    posts = []
+    for v in np.linspace(*(data["control_grid"]["v"][key] for key in ("low", "high", "points"))):
+        for s in np.linspace(
+            *(data["control_grid"]["s"][key] for key in ("low", "high", "points"))
+        ):
+            x, h = mesh.ravel(), 0.3
+            k1 = slope(0, x, v, s)
+            k2 = slope(0, x + h / 2 * k1, v, s)
+            k3 = slope(0, x + h / 2 * k2, v, s)
+            k4 = slope(0, x + h * k3, v, s)
+            end = (x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)).reshape(3, -1)
+            growth = abs(v) * np.sqrt(np.tan(s) ** 2 / 4 + 1) * h * width[2] / 2
+            radius = (width / 2 + [growth, growth, 0.0])[:, None] * (1 + 1e-9)
+            a, b = ((end + sign * radius - low[:, None]) / width[:, None] for sign in (-1, 1))
+            out = ((a <= 0) | (b >= cells[:, None])).any(axis=0)
+            ends = (np.clip(np.floor(x), 0, cells[:, None] - 1).astype(int) for x in (a, b))
+            posts.append((*ends, out))
+    won = target.copy()
+    while True:
+        sums = np.zeros(cells + 1, dtype=int)
+        sums[1:, 1:, 1:] = (~won).cumsum(0).cumsum(1).cumsum(2)
+        new = won.copy()
+        for first, last, out in posts:
+            total = 0
+            for corner in np.ndindex(2, 2, 2):
+                at = [last[k] + 1 if c else first[k] for k, c in enumerate(corner)]
+                total = total + (-1) ** (3 - sum(corner)) * sums[tuple(at)]
+            new |= ((total == 0) & ~out).reshape(shape) & ~unsafe
+        if (new == won).all():
+            return (won & ~target).ravel()
+        won = new
+
+
+def enclosed(data, judged):
+    return lm.solve(made({**data, "system": {**data["system"], "judged": judged},
+                          "successors": "enclosed"}))  # fmt: skip
+
+
+@pytest.mark.parametrize("judged", ["endpoint", "path"])
+def test_a_small_maze(judged):
+    data = maze(*SMALL, per_axis=1, corners=False, controls=5)
+    result = enclosed(data, judged)
+    assert result.verified
+    assert result.claims["safe"]
+    assert result.simulate(10_000, 300, as_compiled=True).lost == 0
+    if judged == "path":  # of the equation itself, by SciPy alone
+        lost, reached = lost_and_reached(data, result, 100, 80)
+        assert lost == 0
+        assert reached > 80
+    else:
+        won = winning(data, result.cell_status)
+        assert won.sum() > 500
+        assert not (won & (result.sure_levels <= 0)).any()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "sure", "kept"), [("maze", 48_018, 53_000), ("planning", 19_563, 19_563)]
+)
+def test_published_problems(name, sure, kept):
+    """As many cells as the winning sets of SCOTS on the same grids (48,018 and 19,563)."""
+    if name == "maze":
+        data = maze(10.0, WALLS, {"x": [9, 9.5], "y": [0, 0.5]}, 2, False)
+    else:
+        data = maze(10.0, PLANNING, {"x": [3, 3.6], "y": [0.3, 0.8]}, 2, False)
+        data["state_box"]["x"] = {"low": 0.1, "high": 3.9, "cells": 19}
+        data["state_box"]["y"] = {"low": 0.1, "high": 9.9, "cells": 49}
+    result = enclosed(data, "endpoint")
+    assert result.verified
+    assert result.claims["safe"]
+    assert result.sure_cells >= sure
+    assert result.stabilizable_cells >= kept
+    won = winning(data, result.cell_status)
+    assert not (won & (result.sure_levels <= 0)).any()
+    runs = result.simulate(100_000, 1_000, as_compiled=True)
+    assert runs.lost == 0
+    assert runs.reached > 99_000
+    print(f"{name}: C {result.stabilizable_cells}, sure {result.sure_cells}, won {won.sum()}")
+
+
+def test_safety_of_the_boost_converter():
+    """The published regulation of a DC-DC converter, killed at random; here 80 x 80 cells."""
+    linear = {
+        1: ("0.9917012926388759*i + 0.16597414722248083", "0.9929178767321044*v"),
+        2: ("0.9902950292942829*i - 0.032892318823717294*v + 0.16587291875265632",
+            "0.03524177016826852*i + 0.992333178469695*v + 0.0029450833173848515"),
+    }  # fmt: skip
+    i, v = (f"where(mode == 1, {linear[1][k]}, {linear[2][k]})" for k in range(2))
+    result = lm.solve(made({
+        "format": "lmdsl/1",
+        "let": {"j": i},
+        "system": {"kind": "map", "next": {
+            "i": "where(kill == 1, 1.1475, where(j < 1.15, 99, j))",
+            "v": f"where(kill == 1, 5.65, {v})"}},
+        "state_box": {"i": {"low": 1.145, "high": 1.55, "cells": 81},
+                      "v": {"low": 5.45, "high": 5.85, "cells": 80}},
+        "attractor": {"boxes": [{"i": [1.145, 1.15]}]},
+        "control_grid": {"mode": {"values": [1, 2]}},
+        "noise": {"kill": {"values": [0, 1], "weights": [0.99, 0.01]}},
+        "stage_cost": "1",
+        "sampling": {"kind": "grid", "per_axis": 2},
+        "successors": "enclosed",
+    }))  # fmt: skip
+    assert result.verified
+    assert result.claims["safe"]
+    assert result.sure_cells == 0  # nothing but chance ends a run
+    assert result.simulate(20_000, 3_000, as_compiled=True).lost == 0
