@@ -184,3 +184,38 @@ def test_a_time_limit_leaves_a_sound_proof():
     proof = result.prove(1.0, time_limit=1e-6)
     assert proof.arrives + proof.lost + proof.stays + proof.undecided == pytest.approx(1)
     assert not proof.reached
+
+
+def test_without_an_attractor_staying_is_the_target():
+    """x+ = x/2 + 1/4 of a killed chain: C is all cells, and what starts there stays."""
+    data = line("0.5*x + 0.25", discount=0.9, attractor={})
+    _, proof = proved(data, target=0.999)
+    assert proof.stays == 1
+    assert proof.arrives == 0
+    assert proof.reached
+
+
+def test_the_cost_of_a_killed_chain_counts_the_discount():
+    data = line("0.125 + 0.25*floor(4*x - 1)", discount=0.5, gamma=1.0)
+    result, proof = proved(data, target=0.9)
+    b = box_at(proof, result.partition, np.array([0.6]))
+    assert proof.cost_above[b] == pytest.approx(1 + 0.5)
+
+
+def test_a_controller_inside_the_attractor_that_is_proved_to_hold():
+    data = line("0.5*x", local_controller={"kind": "constant", "control": {}})
+    data["attractor"] = {"boxes": [{"x": [0, 0.25]}]}
+    _, proof = proved(data)
+    assert proof.holds is True
+    data["system"]["next"]["x"] = "where(x < 0.25, x + 0.2, 0.5*x)"
+    _, proof = proved(data, target=0.5)
+    assert proof.holds is False
+
+
+def test_an_empty_answer_is_said_in_words():
+    data = line("where(abs(x - 0.95) < 0.03, 0.5*x + 0.475, x - 0.25)")
+    _, proof = proved(data, target=0.95)
+    text = str(proof)
+    assert "stay elsewhere" in text
+    assert "for example from (" in text
+    assert "not reached" in text
