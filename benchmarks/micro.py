@@ -74,6 +74,10 @@ def measure(name: str, repeats: int) -> dict[str, Any]:
             note(at_ends, lambda: lm.compile(ends), "sample", samples)
             run = "compile, judged along paths"
             note(run, lambda: lm.compile(problem), "sample", samples, at_ends)
+        if problem.noise is None:
+            sure = problem.replaced(successors="enclosed")
+            run = "compile, successors enclosed"
+            note(run, lambda: lm.compile(sure), "sample", samples, "compile")
         if (function := _as_function(problem)) is not None:
             run = "compile, a Python function"
             note(run, lambda: lm.compile(function), "sample", samples, "compile")

@@ -60,6 +60,8 @@ declared = {
     # The points of a cell from which the map is run: "kind": "grid" with "per_axis"; "random" or
     # "sobol" with "points" and "seed"; "corners": true adds the corners of the cell.
     "sampling": {"kind": "grid", "per_axis": 3},
+    # To lose no run, whatever lies between the points: "enclosed" (proved; it takes longer):
+    #     "successors": "enclosed",
     # The cost of the n-th step counts gamma**n times: above 1 it also asks for speed. With a
     # "discount" of 0.95 a run ends after each step with probability 0.05, and needs no attractor.
     "gamma": 1.0,

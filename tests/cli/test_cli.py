@@ -19,7 +19,7 @@ KEYS = [
     "contraction", "gamma_bar", "cells", "controls", "pairs", "attractor_cells",
     "stabilizable_cells", "polish_steps", "seconds", "message",
     "local_controller", "beyond_gamma", "coverage", "simulation", "data",
-    "integration_error",
+    "integration_error", "sure_cells", "claims",
 ]  # fmt: skip
 
 
@@ -49,8 +49,9 @@ def test_solve_and_everything_after(capsys, file, tmp_path):
     assert report.pop("coverage") == {"stabilizable": 392, "free": 392, "share": 1}
     runs = report.pop("simulation")
     assert report.pop("integration_error") is None
+    assert report.pop("sure_cells") is None
     assert (runs["starts"], runs["reached"]) == (1000, 1000)
-    assert {"coverage", "simulation", "integration_error"} & stored.keys() == set()
+    assert {"coverage", "simulation", "integration_error", "sure_cells"} & stored.keys() == set()
     assert {key: stored[key] for key in report} == report
     assert len(stored["model_sha256"]) == 64
     with np.load(out / "solution.npz", allow_pickle=False) as arrays:

@@ -62,7 +62,7 @@ def test_the_script_names_every_key_and_kind():
 
 def test_what_the_script_offers_in_comments_is_accepted():
     offered = re.findall(r'^    #     ("\w+": .*),$', SCRIPT, re.MULTILINE)
-    assert len(offered) == 6
+    assert len(offered) == 7
     for line in offered:
         change = json.loads("{" + line + "}")
         data = {**declared(), **change}
