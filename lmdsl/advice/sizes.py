@@ -24,6 +24,7 @@ from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.grid.boxes import Ends
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
+from lmdsl.problem.local_control import without_orbit
 from lmdsl.problem.problem import Problem
 
 # Additions above which compiling is no survey: on the problem's own cells, and on others.
@@ -67,7 +68,7 @@ def levels(problem: Problem, deadline: Deadline) -> list[Level]:
         On half as many cells an axis first, then on those; empty where neither can be. The numbers
         of cells are at most twice the problem's own.
     """
-    bare = problem.replaced(measure=None, local_controller=None)
+    bare = problem.replaced(measure=None, **without_orbit(problem.local_controller))
     found: list[Level] = []
     for power in (1, 0, -1, -2, -3, -4, -5, -6):
         cells = {

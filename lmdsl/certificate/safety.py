@@ -6,7 +6,7 @@ lies in C u A, and its way in the box outside avoid (docs/mathematics.md).
 
 from lmdsl.common.types import Bools, Guard, Policy
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.sets import CellSets
+from lmdsl.model.stabilizable_set import sets_of
 from lmdsl.model.successors.inclusion import Inclusion
 
 
@@ -30,7 +30,7 @@ def sentence(lp: StabilizationLP, unsafe: int) -> str:
 
 def kept(lp: StabilizationLP, policy: Policy, guard: Guard | None = None) -> Bools:
     """Return from which cells all that a policy can meet is proved to lie in C u A, shape (n,)."""
-    sets = CellSets.of(lp.problem, lp.partition)
+    sets = sets_of(lp.cell_status)
     allowed = sets.attractor.copy()
     allowed[lp.cells] = True
     return Inclusion(lp.problem, lp.partition, sets, allowed)(lp.cells, lp.control[policy], guard)

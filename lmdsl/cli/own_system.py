@@ -68,8 +68,9 @@ declared = {
     # Where runs start, if not everywhere: "measure" with "boxes" or "where", and a "density"
     # (a formula in the states) or "weights" (a number for each cell).
     #     "measure": {"boxes": [{"angle": [-3.141592653589793, 0], "speed": [-1, 1]}]},
-    # What to do once there: "local_controller", of "kind" "constant" ("control"), "linear" ("gain",
-    # about an "orbit") or "lqr" ("state_weights", "control_weights"):
+    # What to do once there: "local_controller", of "kind" "hold" (controls of the grid that keep
+    # runs there; "partial"), "constant" ("control"), "linear" ("gain", about an "orbit") or "lqr"
+    # ("state_weights", "control_weights"):
     #     "local_controller": {"kind": "lqr", "orbit": [{"angle": 0, "speed": 0}]},
 }
 

@@ -13,6 +13,7 @@ from lmdsl.model.assembly.substeps import ATTEMPTS, COST_GOAL, MOST, JudgedPairs
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
+from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 
 TOO_MUCH = 0.1  # cell widths by which a step may miss the equation before this is said
@@ -156,7 +157,8 @@ def _missed(pairs: JudgedPairs, rates: Quadrature) -> float | None:
     integrator = Integrator(TrueMap(problem, partition), statuses(pairs.sets), ATTEMPTS)
     rows = rates.rows[:FEW]
     held = {name: x[rows] for name, x in pairs.drawn.items()}
-    moved = integrator.move(held, pairs.guard, True, 0)
+    absorb = absorbed_on_way(problem.local_controller)
+    moved = integrator.move(held, pairs.guard, absorb, 0)
     inside = np.flatnonzero(moved.cell >= 0)
     inside = inside[~pairs.sets.avoid[moved.cell[inside]]]
     return relative(rates.integral[inside], moved.cost[inside]) if len(inside) else None

@@ -25,7 +25,8 @@ class Controller(Frozen):
     vectors
         Control vectors, shape (M, p).
     index
-        Control index of every cell, shape (N,), -1 where there is none.
+        Control index of every cell, shape (N,), -1 where there is none; on attractor cells that
+        of ``hold``.
     local
         Feedback on the attractor cells, None without one.
     """

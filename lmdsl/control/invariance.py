@@ -20,6 +20,7 @@ from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.discretization import noise_nodes, noise_parts
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
+from lmdsl.model.local.holding import HoldingLaw
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 
@@ -40,7 +41,7 @@ class LocalCheck(Reported):
     Attributes
     ----------
     kind
-        ``constant``, ``linear`` or ``lqr``.
+        ``constant``, ``linear``, ``lqr`` or ``hold``.
     multiplier
         Largest modulus of the multipliers of the linearised orbit; below 1 it attracts.
     cells
@@ -52,6 +53,9 @@ class LocalCheck(Reported):
     samples, kept
         Random states of A, and how many of them are mapped into A by every noise node. Fewer where
         there are many nodes or operations, or no more time.
+    holding
+        Of ``hold``, the attractor cells that hold; what is proved and sampled is of these, and
+        that they are mapped into these. Else None.
     """
 
     kind: str
@@ -60,10 +64,15 @@ class LocalCheck(Reported):
     proved: int | None
     samples: int
     kept: int
+    holding: int | None = None
 
     def sentence(self) -> str:
         """Return one line for people."""
         line = f"{self.kind}: "
+        if self.holding == 0:
+            return line + "no attractor cell holds"
+        if self.holding is not None:
+            line += f"{self.holding} of {self.cells} attractor cells hold; "
         if self.proved is not None:
             known = f"{self.proved} of {self.cells} attractor cells are"
             line += known if self.proved else "no attractor cell is"
@@ -78,20 +87,21 @@ class LocalCheck(Reported):
 
 def examine(
     problem: Problem,
-    local: LocalController,
+    local: LocalController | HoldingLaw,
     deadline: Deadline | None = None,
     samples: int | None = None,
+    proved: int | None = None,
 ) -> LocalCheck:
     """Check whether the local controller of a problem keeps the attractor cells.
 
     The deadline ends the work with what is known; ``samples`` are as many random states as take
-    some seconds where their number is not given.
+    some seconds where their number is not given; ``proved`` is known for some.
     """
     cells, loop = np.flatnonzero(local.attractor), _Loop(problem, local, Deadline.of(deadline))
     if samples is None:
         work = FUNCTION if loop.true_map.map.enclose is None else loop.true_map.map.work
         samples = int(min(SAMPLES, max(SAMPLED_WORK // (work * len(loop.nodes)), FEWEST)))
-    proved = _proved(loop, cells)
+    proved = _proved(loop, cells) if proved is None else proved
     samples, kept = _sampled(loop, cells, samples)
     kind = "constant" if problem.local_controller is None else problem.local_controller.kind
     return LocalCheck(kind, local.multiplier, len(cells), proved, samples, kept)
@@ -100,7 +110,9 @@ def examine(
 class _Loop:
     """The true map under the local controller, all noise nodes, and what ends the work in time."""
 
-    def __init__(self, problem: Problem, local: LocalController, deadline: Deadline) -> None:
+    def __init__(
+        self, problem: Problem, local: LocalController | HoldingLaw, deadline: Deadline
+    ) -> None:
         self.local, self.partition = local, local.partition
         self.true_map, self.nodes = TrueMap(problem, local.partition), noise_nodes(problem).values
         self.parts = noise_parts(problem)
@@ -211,11 +223,14 @@ def _closed(loop: _Loop, cell: Indices, box: Interval, noise: Interval) -> tuple
     d = loop.partition.dimension
     x = [Jet.variable(Interval(box.low[:, i], box.high[:, i]), i, d) for i in range(d)]
 
+    def jets(values: Any) -> list[Jet]:
+        return [y if isinstance(y, Jet) else Jet.constant(y, d) for y in values]
+
     def on_jets(operation: str, *operands: Any) -> Any:
-        return apply(operation, [y if isinstance(y, Jet) else Jet.constant(y, d) for y in operands])
+        return apply(operation, jets(operands))
 
     ends = zip(noise.low[:, None], noise.high[:, None], strict=True)
-    u, w = loop.local.law(x, cell, on_jets), [Jet.held(Interval(*end), d) for end in ends]
+    u, w = jets(loop.local.law(x, cell, on_jets)), [Jet.held(Interval(*end), d) for end in ends]
     images = loop.true_map.enclose(x, u, w, loop.guard)
     assert images is not None
     return images

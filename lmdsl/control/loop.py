@@ -19,7 +19,7 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
-from lmdsl.problem.local_control import ConstantControl
+from lmdsl.problem.local_control import ConstantControl, HoldControl, absorbed_on_way
 from lmdsl.problem.problem import Problem
 from lmdsl.systems import DataSystem, MatrixSystem
 from lmdsl.systems.matrices.system import Draws
@@ -38,7 +38,8 @@ class Held:
     Attributes
     ----------
     steps
-        Steps each run went on after its first entry into A.
+        Steps each run went on after its first entry into A; of a partial ``hold`` each that entered
+        a cell that holds.
     stayed, returned, away, lost
         Runs that never left A; that left it and are back at the end; that are underway at the
         end; that were lost.
@@ -105,6 +106,12 @@ class ClosedLoop:
         paid = isinstance(system, MatrixSystem) and system.pays_all
         self._stage, self._terminal = None if paid else problem.stage(), problem.terminal()
 
+    @property
+    def holds(self) -> bool:
+        """Whether there are controls on the attractor cells."""
+        held = isinstance(self.problem.local_controller, HoldControl)
+        return held or self.controller.local is not None
+
     @cached_property
     def compiled(self) -> "ClosedLoop":
         """The same by the compiled step and its noise nodes."""
@@ -157,6 +164,7 @@ class ClosedLoop:
         values = self.true_map.named(list(x.T), list(u.T), w)
         guard = partial(deadline.raise_if_over, "simulating")
         if self.draws is None:
+            absorb = absorb and absorbed_on_way(self.problem.local_controller)
             moved = self.steps.move(values, guard, absorb, pieces)
         else:
             guard()
@@ -226,10 +234,13 @@ class ClosedLoop:
         self, x: Floats, steps: int, rng: np.random.Generator, deadline: Deadline = FOREVER
     ) -> Held:
         """Run on from states of A, under the local controller inside A and the other outside."""
-        local = self.controller.local
-        if local is None:
+        if not self.holds:
             raise BadInput("the problem names no local controller", "local_controller")
-        (x, cell), runs = self.partition.enter(x), len(x)
+        local, (x, cell) = self.controller.local, self.partition.enter(x)
+        if local is None:  # of the cells of a partial hold, those that hold
+            on = self.controller.index[cell] >= 0
+            x, cell = x[on], cell[on]
+        runs = len(x)
         stayed = np.ones(runs, dtype=np.bool_)
         for n in range(steps):
             try:
@@ -247,7 +258,7 @@ class ClosedLoop:
         inside = self.status[cell] == CellStatus.ATTRACTOR
         distance = None
         constant = isinstance(self.problem.local_controller, ConstantControl)
-        if inside.any() and not constant:
+        if inside.any() and local is not None and not constant:
             away = local.distance(x[inside])
             distance = (float(np.median(away)), float(away.max()))
         return Held(

@@ -186,7 +186,7 @@ def simulate(
     held = None
     with loop.true_map.helped():
         runs = loop.run(x, steps, rng, deadline)
-        if loop.controller.local is not None:
+        if loop.holds:
             held = loop.hold(runs.arrived, hold, rng, deadline)
     outcome, taken = runs.outcome, runs.taken
     reached = int((outcome == REACHED).sum())

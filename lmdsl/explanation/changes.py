@@ -28,6 +28,7 @@ from lmdsl.explanation.trials import MapTrial, some
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import LOST, CellStatus
+from lmdsl.problem.local_control import without_orbit
 from lmdsl.problem.problem import Problem
 from lmdsl.systems import MatrixSystem
 
@@ -57,7 +58,7 @@ def changes(
         return
     kept = int((status == CellStatus.STABILIZED).sum())
     share = kept / (kept + lost)
-    bare = problem.replaced(measure=None, local_controller=None)
+    bare = problem.replaced(measure=None, **without_orbit(problem.local_controller))
     yield from _longer_step(MapTrial(bare, partition, deadline), status, share, deadline)
     yield from _periodic(MapTrial(bare, partition, deadline), share, deadline)
     yield from _box(bare, share, deadline)

@@ -5,7 +5,6 @@ Dual:  max m'V  s.t.  V[cell(k)] <= gamma (P V)[k] + G[k] for every surviving pa
 So ``A = (E - gamma P)'`` is (n, K), ``b = m``, ``c = G``; columns go by cell, then control.
 """
 
-import hashlib
 import os
 from dataclasses import InitVar, dataclass, replace
 from typing import Any, ClassVar
@@ -25,9 +24,11 @@ from lmdsl.model import algorithm_1, stabilizable_set
 from lmdsl.model.assembly.estimates import require_least, unless_short
 from lmdsl.model.assembly.substeps import settled
 from lmdsl.model.assembly.transitions import assemble
+from lmdsl.model.digest import digest_of
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local import holding
 from lmdsl.model.local.controller import LocalController
 from lmdsl.model.rows import RowArrays, Rows
 from lmdsl.model.sets import CellSets
@@ -67,6 +68,9 @@ class StabilizationLP(Frozen):
         ``measure`` lies in C).
     sure_levels
         See :meth:`Successors.sure_levels`; None where successors are not enclosed.
+    hold
+        Control index of the attractor cells that hold, -1 elsewhere, shape (N,), int32; None where
+        the problem does not ask for them.
     """
 
     problem: Problem
@@ -81,6 +85,7 @@ class StabilizationLP(Frozen):
     gamma: float
     weight: Floats
     sure_levels: NDArray[np.int32] | None = None
+    hold: holding.Controls | None = None
     _known: InitVar[Levels | None] = None
     _levels: ClassVar[Levels | None] = None
 
@@ -221,19 +226,7 @@ class StabilizationLP(Frozen):
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the compiled model: statuses, pairs, exact transitions, costs, gamma, m."""
-        sha = hashlib.sha256(b"lmdsl model 1\n")
-        shares = self.rows.shares
-        below = [*shares.denominator] if shares.total is None else shares.total
-        sha.update(repr((below, [*shares.numerator])).encode())
-        sha.update(np.array([self.gamma], dtype="<f8").tobytes())
-        for array, kind in (
-            (self.cell_status, "<u1"), (self.pair_pointer, "<i8"), (self.control, "<i4"),
-            (self.rows.pointer, "<i8"), (self.rows.target, "<i4"), (self.rows.code, "<u4"),
-            (self.cost, "<f8"), (self.weight, "<f8"), (self.controls, "<f8"),
-        ):  # fmt: skip
-            for part in np.array_split(array.ravel(), max(1, array.size // 2**22)):
-                sha.update(np.ascontiguousarray(part, dtype=kind).tobytes())
-        return sha.hexdigest()
+        return digest_of(self)
 
     def expand(self, values: NDArray[Any], attractor: Any, outside: Any) -> NDArray[Any]:
         """Spread values on C over all N cells."""
@@ -288,11 +281,12 @@ def compile(  # noqa: A001
     partition = Partition.of(problem)
     require_least(problem)
     limit = unless_short(problem, deadline)
+    declared = CellSets.of(problem, partition, limit)
     if problem.local_controller is not None:  # refuse a wrong one before the work
-        attractor = CellSets.of(problem, partition, limit).attractor
-        LocalController.of(problem, partition, attractor, limit)
-    transitions = assemble(problem, partition, progress, deadline)
-    sets = transitions.sets
+        LocalController.of(problem, partition, declared.attractor, limit)
+    hold = holding.held(problem, partition, declared, limit)
+    sets = holding.within(declared, problem, hold)
+    transitions = assemble(problem, partition, progress, deadline, sets)
     successors = Successors.asked_for(problem, partition, transitions, deadline, progress)
     found = stabilizable_set.of_problem(problem, transitions, deadline, successors)
     kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
@@ -313,6 +307,7 @@ def compile(  # noqa: A001
         gamma=problem.gamma,
         weight=sets.weight(cells),
         sure_levels=None if successors is None else successors.sure_levels(),
+        hold=hold,
         _known=(found.level[found.inside], column),
     )
     views = (lp.controls, lp.control, lp.cost)

@@ -29,6 +29,7 @@ from lmdsl.machine.kernels import kernel
 from lmdsl.model.algorithm_1 import Predecessors, owner, tree
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.rows import Rows
+from lmdsl.model.sets import CellSets
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem.problem import Problem
 
@@ -95,6 +96,29 @@ def stabilizable(
         _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)
 
 
+def keeping(
+    pair_pointer: Indices, rows: Rows, successors: Successors | None = None
+) -> tuple[Bools, Bools]:
+    """Return the greatest set of cells that can be kept, and the pairs that keep it.
+
+    In it every cell has a pair all of whose successors lie in it: those of the rows, or all that
+    images can meet. A run that ends by discount has not left it.
+    """
+    alive = np.ones(rows.count, dtype=np.bool_)
+    if successors is not None:
+        alive &= successors.admissible
+    inside = np.ones(rows.columns, dtype=np.bool_)
+    cell = owner(pair_pointer)
+    choices = np.bincount(cell[alive], minlength=rows.columns).astype(np.int64)
+    if successors is not None:
+        successors.remove(choices == 0, alive, inside)
+        return inside, alive
+    before = Predecessors.of(rows.without_end())
+    lost = np.flatnonzero(choices == 0)
+    _remove(lost, before.pointer, before.pair, cell, pair_pointer, alive, inside, choices)
+    return inside, alive
+
+
 def of_problem(
     problem: Problem,
     transitions: Transitions,
@@ -121,6 +145,12 @@ def statuses(transitions: Transitions, found: Stabilizable) -> Statuses:
     status[transitions.sets.free] = free
     status[transitions.sets.attractor] = CellStatus.ATTRACTOR
     return status
+
+
+def sets_of(status: Statuses) -> CellSets:
+    """Return the sets that were compiled; their mass is not known here: 1 everywhere."""
+    attractor, avoid = status == CellStatus.ATTRACTOR, status == CellStatus.AVOID
+    return CellSets.made(attractor, avoid, np.ones(len(status)))
 
 
 def _choices(transitions: Transitions, admissible: Bools | None) -> Indices:

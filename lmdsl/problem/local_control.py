@@ -90,7 +90,36 @@ class LqrFeedback(Declared):
     control_weights: PositiveNumbers = Field(default_factory=dict, validate_default=True)
 
 
+class HoldControl(Declared):
+    """A local controller that keeps runs in the attractor cells by controls of the grid.
+
+    The cells that hold are the greatest set of attractor cells in each of which some control keeps
+    all successors in the set. The other attractor cells become ordinary ones.
+
+    Attributes
+    ----------
+    partial
+        Whether the other attractor cells remain a goal; a run that enters one may leave it again.
+    """
+
+    kind: Literal["hold"] = "hold"
+    partial: bool = False
+
+
 if TYPE_CHECKING:
-    LocalUnion = ConstantControl | LinearFeedback | LqrFeedback
+    LocalUnion = ConstantControl | LinearFeedback | LqrFeedback | HoldControl
 else:
-    LocalUnion = kinds(ConstantControl, LinearFeedback, LqrFeedback)
+    LocalUnion = kinds(ConstantControl, LinearFeedback, LqrFeedback, HoldControl)
+
+
+def without_orbit(local: "LocalUnion | None") -> dict[str, None]:
+    """Return the change by which a problem names no orbit, which other cells might not hold."""
+    return {} if isinstance(local, HoldControl) else {"local_controller": None}
+
+
+def absorbed_on_way(local: "LocalUnion | None") -> bool:
+    """Return whether a path ends where it meets the attractor on the way.
+
+    It goes on where controls of the grid are to hold it: they are chosen at the ends of steps.
+    """
+    return not isinstance(local, HoldControl)

@@ -12,15 +12,15 @@ from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Certificate, Verified, Witness
 from lmdsl.common.types import Floats
 from lmdsl.control.accuracy import IntegrationError, integration_error
-from lmdsl.control.invariance import examine
+from lmdsl.control.staying import check_of
 from lmdsl.data.report import DataReport
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.local.controller import LocalController
+from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.sets import CellSets, attractor_note
-from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.sets import attractor_note
+from lmdsl.model.stabilizable_set import CellStatus, sets_of
 from lmdsl.problem.problem import Problem
 from lmdsl.results.polishing import _Outcome
 from lmdsl.results.result import Result
@@ -150,11 +150,7 @@ class _Job:
     def _integration_error(self) -> IntegrationError | None:
         """Judge the compiled steps, where there is time."""
         try:
-            lp = self.lp
-            attractor = lp.cell_status == CellStatus.ATTRACTOR
-            avoid = lp.cell_status == CellStatus.AVOID
-            sets = CellSets.made(attractor, avoid, np.ones(lp.partition.size))
-            return integration_error(lp.problem, sets, self.finish)
+            return integration_error(self.lp.problem, sets_of(self.lp.cell_status), self.finish)
         except TimeLimitReached:
             return None
 
@@ -176,9 +172,11 @@ class _Job:
         index = np.full(lp.partition.size, -1, dtype=np.int32)
         if witness.policy is not None:
             index[lp.cells] = lp.control[witness.policy]
+            index = index if lp.hold is None else np.maximum(index, lp.hold)
         solved = status != Status.NOT_STABILIZABLE
         attractor = lp.cell_status == CellStatus.ATTRACTOR
-        local = LocalController.of(lp.problem, lp.partition, attractor)
+        local = check_of(lp, self.finish)
+        held = holding.note(lp.problem, lp.partition, lp.hold)
         data = self._data(witness)
         error = self._integration_error()
         said = [data.sentence() if data else "", error.warning() if error else ""]
@@ -196,9 +194,9 @@ class _Job:
             pairs=lp.K,
             attractor_cells=int(attractor.sum()),
             stabilizable_cells=lp.n,
-            local_controller=None if local is None else examine(lp.problem, local, self.finish),
+            local_controller=local,
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
-            message=_together(message, attractor_note(lp.problem, lp.partition), *said),
+            message=_together(message, attractor_note(lp.problem, lp.partition), held, *said),
             data=data,
             integration_error=error,
             problem=lp.problem,

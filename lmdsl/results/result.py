@@ -78,7 +78,7 @@ class Result(Summary):
     model_sha256
         Digest of the compiled model, as read from a directory.
     cause
-        Why it is not stabilizable: ``empty``, ``measure``, ``gamma`` or ``require_all``.
+        Why it is not stabilizable: ``empty``, ``measure``, ``gamma``, ``require_all``, ``hold``.
     """
 
     problem: Problem

@@ -17,6 +17,7 @@ from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
+from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility import first_policy, gamma_bar, restriction
@@ -205,6 +206,8 @@ def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:
 
 def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[Cause, str] | None:
     """Return the cause and a sentence where the graph alone rules the problem out."""
+    if holding.none_holds(lp.hold):
+        return Cause.HOLD, holding.why_none(lp.problem, lp.partition)
     if not lp.n:
         if not np.isin(lp.cell_status, LOST).any():
             return Cause.EMPTY, "every cell is attractor or avoid; there is nothing to stabilize"

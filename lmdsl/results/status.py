@@ -30,3 +30,4 @@ class Cause(_Word):
     MEASURE = "measure"
     GAMMA = "gamma"
     REQUIRE_ALL = "require_all"
+    HOLD = "hold"

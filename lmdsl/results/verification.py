@@ -24,6 +24,7 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.assembly.estimates import estimate
 from lmdsl.model.assembly.transitions import shares_of
 from lmdsl.model.discretization import noise_nodes, sample_points
+from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.rows import Rows
 from lmdsl.model.sets import CellSets
@@ -237,6 +238,7 @@ def _judge_refusal(
         Cause.MEASURE: bool(lp.n) and not lp.weight.any(),
         Cause.REQUIRE_ALL: bool(np.isin(lp.cell_status, LOST).any()),
         Cause.GAMMA: certificate.refusal,
+        Cause.HOLD: holding.none_holds(lp.hold),
     }
     if result.cause is None or not proved[result.cause]:
         reasons.append(f"the refusal ({result.cause}) is not proved by the recompiled model")
@@ -279,7 +281,7 @@ def _stored_model(path: str | os.PathLike[str], result: Result) -> Stabilization
     return StabilizationLP(
         problem, result.partition, result.control_vectors, status, cells,
         small["pair_pointer"], small["control"], rows, small["cost"], problem.gamma,
-        sets.weight(cells),
+        sets.weight(cells), hold=holding.stored(problem, status, result.control_index),
     )  # fmt: skip
 
 

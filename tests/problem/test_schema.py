@@ -41,6 +41,8 @@ VARIED = [
     steps(local_controller=LQR, avoid={"boxes": [{"x": [0.75, 1]}]}, on_exit="clip"),
     steps(local_controller=LINEAR, sampling={"kind": "sobol", "points": 4, "seed": 2}),
     steps(local_controller={"kind": "constant", "control": {"u": 0}}, name="a", gamma=0.5),
+    steps(local_controller={"kind": "hold"}),
+    steps(local_controller={"kind": "hold", "partial": True}, successors="enclosed"),
     steps(attractor={"points": [[0.1], {"x": 0.2}], "boxes": [{"x": [0, 0.25]}], "cells": [[0]]}),
     steps(sampling={"kind": "random", "points": 4, "seed": 2}, system=ODE),
     steps(sampling={"kind": "grid", "per_axis": 2}),
@@ -257,6 +259,8 @@ def test_bounds_of_the_models_are_in_it(schema):
         ("system", {**ODE, "substeps": 1001}),
         ("system", {**ODE, "step": 0}),
         ("local_controller", {**LQR, "orbit": []}),
+        ("local_controller", {"kind": "hold", "partial": 0}),
+        ("local_controller", {"kind": "hold", "control": {"u": 0}}),
         ("local_controller", {**LQR, "state_weights": {"x": 0}}),
         ("name", "a" * 1001),
     ]

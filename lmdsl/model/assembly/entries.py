@@ -13,6 +13,7 @@ from lmdsl.common.types import Floats, Guard
 from lmdsl.model.assembly.paths.judging import Endings, PathJudge, path_doubles
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
+from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.runge_kutta import RungeKutta
 
@@ -37,7 +38,8 @@ class Entries:
         self.partition, self.sets = partition, sets
         flow, self.terminal = integrated(problem), problem.terminal()
         endpoint = problem.judged == "endpoint"
-        self.path = None if flow is None else PathJudge(flow, partition, sets, endpoint)
+        absorb = absorbed_on_way(problem.local_controller)
+        self.path = None if flow is None else PathJudge(flow, partition, sets, endpoint, absorb)
         self.factor = problem.gamma * (1.0 if problem.discount is None else problem.discount)
 
     @classmethod

@@ -51,8 +51,13 @@ def assemble(
     partition: Partition,
     progress: Progress | None = None,
     deadline: Deadline | None = None,
+    sets: CellSets | None = None,
+    way: CellSets | None = None,
 ) -> Transitions:
     """Build the rows of every admissible pair.
+
+    ``sets`` are the problem's, where they are known, and ``way`` those that judge what steps meet
+    on their way, and what they pay at its end, where these are others.
 
     TimeLimitReached: the deadline has passed, and it was more than a moment's work. BadInput: the
     problem does not fit in memory, or the stage cost of an admissible pair is negative or not
@@ -60,12 +65,12 @@ def assemble(
     """
     require_least(problem)
     deadline = unless_short(problem, Deadline.of(deadline))
-    sets = CellSets.of(problem, partition, deadline)
+    sets = sets or CellSets.of(problem, partition, deadline)
     if isinstance(problem.system, MatrixSystem):
         from lmdsl.model.assembly.given import of_matrices  # which makes what stands here
 
         return of_matrices(problem, partition, sets)
-    sampler = Sampler(problem, partition, deadline, sets=sets)
+    sampler = Sampler(problem, partition, deadline, sets=way or sets)
     try:
         with sampler.asked.helped():
             sampler.audit(sets.free)

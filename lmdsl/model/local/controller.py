@@ -22,7 +22,12 @@ from lmdsl.model.discretization import control_range
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local import linearisation, riccati
 from lmdsl.model.true_map import TrueMap
-from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
+from lmdsl.problem.local_control import (
+    ConstantControl,
+    HoldControl,
+    LinearFeedback,
+    LqrFeedback,
+)
 from lmdsl.problem.problem import Problem
 
 MAX_RICCATI = 256  # number of its states (orbit points x axes) above which no LQR is computed
@@ -72,7 +77,7 @@ class LocalController(Frozen):
         attractor: Bools,
         deadline: Deadline | None = None,
     ) -> Self | None:
-        """Return the local controller of a problem, None where it names none.
+        """Return the feedback of a problem around an orbit, None where it names none.
 
         Raises
         ------
@@ -83,7 +88,7 @@ class LocalController(Frozen):
             or the Riccati equation has no stabilizing solution.
         """
         declared = problem.local_controller
-        if declared is None:
+        if declared is None or isinstance(declared, HoldControl):
             return None
         low, high = control_range(problem)
         if isinstance(declared, ConstantControl):

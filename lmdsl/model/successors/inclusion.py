@@ -66,7 +66,7 @@ class Inclusion:
         self.encloser, self.domains, self.controls = grid.encloser, grid.domains, grid.controls
         self.unit = partition.width / grid.pieces
         self.cuts = sum(int(n).bit_length() - 1 + CUTS for n in grid.pieces)
-        self.judged = PathTables.of(sets, partition)
+        self.judged = PathTables.of(problem, sets, partition)
         self.others, self.allowed = counting.table(~allowed, partition), allowed
         self.true_map = grid.encloser.true_map
         self.admitted, self.names = grid.admitted, grid.names

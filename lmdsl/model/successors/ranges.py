@@ -18,6 +18,7 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors import counting
 from lmdsl.model.successors.slabs import Slab, Slabs, Span, blocks
+from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 
 PAIRS = 2**18  # number of pairs whose ranges are worked on at a time
@@ -51,12 +52,13 @@ class PathTables(NamedTuple):
     absorbed: Indices  # multi-index of a cell of A, shape (d,)
 
     @classmethod
-    def of(cls, sets: CellSets, partition: Partition) -> "PathTables":
+    def of(cls, problem: Problem, sets: CellSets, partition: Partition) -> "PathTables":
         """Return the tables of the sets of a problem."""
         some = int(np.argmax(sets.attractor))
+        absorbs = absorbed_on_way(problem.local_controller)
         return cls(
             counting.table(sets.avoid, partition),
-            counting.table(sets.attractor, partition),
+            counting.table(sets.attractor & absorbs, partition),
             np.array([int(k[0]) for k in partition.multi_index(np.array([some]))]),
         )
 
@@ -80,7 +82,7 @@ def enclosed(
     deadline, progress
         As for :func:`lmdsl.compile`.
     """
-    grid, judged = Slabs(problem, partition, deadline), PathTables.of(sets, partition)
+    grid, judged = Slabs(problem, partition, deadline), PathTables.of(problem, sets, partition)
     cell, control = pairs
     count, parts, d = len(cell), grid.encloser.parts, partition.dimension
     kind = number_type(partition)

@@ -21,7 +21,8 @@ from lmdsl.machine.kernels import fixed
 from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.successors.counting import drop, hulls, lift, table
+from lmdsl.model.sets import CellSets
+from lmdsl.model.successors.counting import drop, hulls, keep, lift, table
 from lmdsl.model.successors.ranges import enclosed
 from lmdsl.problem.problem import Problem
 
@@ -53,20 +54,28 @@ class Successors:
         transitions: Transitions,
         deadline: Deadline,
         progress: Progress | None = None,
+        way: CellSets | None = None,
     ) -> Self | None:
-        """Enclose the images of all pairs of some transitions; None where samples suffice."""
+        """Enclose the images of all pairs of some transitions; None where samples suffice.
+
+        ``way`` are the sets that judge the way of steps, where these are others than judge its end.
+        """
         if problem.successors != "enclosed":
             return None
         pointer, sets = transitions.pair_pointer, transitions.sets
         cell = sets.free[owner(pointer)]
-        found = enclosed(problem, partition, sets, (cell, transitions.control), deadline, progress)
+        pairs = cell, transitions.control
+        found = enclosed(problem, partition, way or sets, pairs, deadline, progress)
         first, last = found.first, found.last
         memory.require(2.0 * first.itemsize * len(sets.free) * partition.dimension, DOING)
         shape = (len(sets.free), 1, partition.dimension)
         least, most = (np.zeros(shape, dtype=first.dtype) for _ in range(2))
         hulls(fixed(pointer), fixed(first), fixed(last), least, most)
         ranges, reach = (fixed(first), fixed(last)), (fixed(least), fixed(most))
-        return cls(transitions, partition, ~found.out, ranges, reach, deadline)
+        admissible = ~found.out
+        if way is not None:
+            keep(table(sets.avoid, partition), *ranges, admissible)
+        return cls(transitions, partition, admissible, ranges, reach, deadline)
 
     def choices(self, alive: Bools) -> Indices:
         """Return how many pairs of every free cell are alive, shape (F,)."""

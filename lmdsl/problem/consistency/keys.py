@@ -8,7 +8,12 @@ from lmdsl.common import spelling
 from lmdsl.common.faults import require_all, written
 from lmdsl.errors import BadInput, shown
 from lmdsl.problem.consistency import endings, texts
-from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
+from lmdsl.problem.local_control import (
+    ConstantControl,
+    HoldControl,
+    LinearFeedback,
+    LqrFeedback,
+)
 from lmdsl.problem.noise import NoiseNormal
 from lmdsl.systems import FunctionSystem, MapSystem, MatrixSystem, OdeSystem
 from lmdsl.systems.named import NamedOde
@@ -162,7 +167,7 @@ def _box_named(box: Mapping[str, tuple[float, float]], states: tuple[str, ...], 
 
 def _local_named(problem: "Problem") -> None:
     local, top = problem.local_controller, "local_controller"
-    if local is None:
+    if local is None or isinstance(local, HoldControl):
         return
     orbit = () if isinstance(local, ConstantControl) else local.orbit
     _points_named(orbit, problem.states, f"{top}.orbit")

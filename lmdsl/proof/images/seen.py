@@ -9,6 +9,7 @@ from lmdsl.machine import threads
 from lmdsl.model.discretization import noise_parts
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 from lmdsl.proof.images import enclosing, places, tapes
 from lmdsl.proof.images.pieces import DEEPEST, Integers, Pieces, pieces
@@ -63,7 +64,8 @@ class BoxImages:
         self.noise = noise_parts(problem)
         self.axes = np.array(partition.axes, dtype=np.float64)
         kind = np.zeros(len(status), dtype=np.int64)
-        kind[status == CellStatus.ATTRACTOR] = places.MAY_ARRIVE
+        if absorbed_on_way(problem.local_controller):
+            kind[status == CellStatus.ATTRACTOR] = places.MAY_ARRIVE
         kind[status == CellStatus.AVOID] = places.MAY_LEAVE
         self.ground = (self.axes, kind, partition.clip, enclosing.HERMITE)
 

@@ -10,16 +10,17 @@ from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
 from lmdsl.common.records import jsonable
 from lmdsl.common.types import Bools, Floats
-from lmdsl.control.invariance import SAMPLES, LocalCheck, examine
+from lmdsl.control.invariance import SAMPLES, LocalCheck
+from lmdsl.control.staying import check_of
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.sampler import Sampler
-from lmdsl.model.local.controller import LocalController
+from lmdsl.model.local.holding import within
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.optimize.feasibility import gamma_bar
 from lmdsl.results.directory.archive import identity
 from lmdsl.results.directory.certificate_file import CertificateFile, scope
-from lmdsl.results.directory.recorded import data_differences
+from lmdsl.results.directory.recorded import data_differences, policy_of
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.systems import FunctionSystem
@@ -151,8 +152,10 @@ def _outside(lp: StabilizationLP, result: Result) -> list[str]:
     ]
     reasons = []
     for name, on_attractor, off, refused in expected:
-        array = getattr(result, name)
-        sound = (array[attractor] == on_attractor).all() and (array[outside] == off).all()
+        array, on = getattr(result, name), np.full(len(attractor), on_attractor)
+        if name == "control_index" and lp.hold is not None and policy_of(lp, result) is not None:
+            on = lp.hold  # and without a policy there is no law
+        sound = (array[attractor] == on[attractor]).all() and (array[outside] == off).all()
         if result.status == Status.NOT_STABILIZABLE:
             sound = sound and (array[lp.cells] == refused).all()
         if not sound:
@@ -198,11 +201,12 @@ def local_differences(
     if isinstance(problem.system, FunctionSystem):  # which can be neither enclosed nor asked
         kept = min(max(stored.kept, 0), samples)
         cells, kind = int(attractor.sum()), problem.local_controller.kind
-        found = LocalCheck(kind, stored.multiplier, cells, None, samples, kept)
+        holding = None if lp.hold is None else int((lp.hold >= 0).sum())
+        found = LocalCheck(kind, stored.multiplier, cells, None, samples, kept, holding)
     else:
-        local = LocalController.of(problem, lp.partition, attractor, deadline)
-        assert local is not None
-        found = examine(problem, local, deadline, samples=samples)
+        checked = check_of(lp, deadline, samples)
+        assert checked is not None
+        found = checked
         deadline.raise_if_over("verifying")  # it ends with less than it could have found
     true = {
         "kind": stored.kind == found.kind,
@@ -211,6 +215,7 @@ def local_differences(
         "proved": (stored.proved or 0) <= (found.proved or 0),
         "samples": stored.samples == found.samples,
         "kept": stored.kept == found.kept,
+        "holding": stored.holding == found.holding,
     }
     return [
         _differs(f"local_controller.{name}", getattr(stored, name), getattr(found, name))
@@ -241,9 +246,10 @@ def function_differences(lp: StabilizationLP, result: Result) -> list[str]:
     from lmdsl.model.sets import CellSets
 
     reasons, status = [], result.cell_status
-    sets = CellSets.of(result.problem, result.partition)
+    declared = CellSets.of(result.problem, result.partition)
+    sets = within(declared, result.problem, lp.hold)
     for code, mask in (
-        (CellStatus.ATTRACTOR, sets.attractor), (CellStatus.AVOID, sets.avoid),
+        (CellStatus.ATTRACTOR, sets.attractor & declared.attractor), (CellStatus.AVOID, sets.avoid),
     ):  # fmt: skip
         if not np.array_equal(status == code, mask):
             reasons.append(f"cell_status differs from the {code.name.lower()} of the problem")

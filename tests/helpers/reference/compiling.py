@@ -6,6 +6,7 @@ from typing import Any
 
 from reference.formulas import value_of
 from reference.grid import number_of_cells, read_axes, unflat
+from reference.holding import asks_to_hold, held_cells
 from reference.model import Pair, ReferenceModel, Row
 from reference.reaching import classify
 from reference.samples import control_vectors, noise_nodes, sample_of, sample_offsets
@@ -22,6 +23,10 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
     A, Z = attractor_cells(problem), avoid_cells(problem)
     if A & Z or not (A or ("discount" in problem and not problem["attractor"])):
         raise ValueError("no attractor cell, or a cell that is both attractor and avoid")
+    hold = None
+    if asks_to_hold(problem):
+        hold = held_cells(problem, axes, (offsets, controls, noise), A, Z)
+        A = A if problem["local_controller"].get("partial") else set(hold)
     step = step_function(problem, axes, A, Z)
     admissible = value_of(problem, problem.get("admissible", "0 == 0"))
     N = number_of_cells(axes)
@@ -42,6 +47,7 @@ def compile_reference(problem: dict[str, Any]) -> ReferenceModel:
         admissible=set(),
         cost={},
         discount=Fraction(float(problem.get("discount", 1))),
+        hold=hold,
     )
     for cell in range(N):
         if cell in A or cell in Z:

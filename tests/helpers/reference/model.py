@@ -36,6 +36,8 @@ class ReferenceModel:
     surviving: list[Pair] = field(default_factory=list)
     m: dict[int, float] = field(default_factory=dict)
     discount: Fraction = Fraction(1)
+    # cell -> control of the attractor cells that hold; None where the problem asks for none
+    hold: dict[int, int] | None = None
     proved: Any = None  # the bracket of gamma_bar, once it is known
 
     @property

@@ -56,14 +56,17 @@ def step_function(
     image, derivative = next_state_function(problem), right_hand_side(problem)
     rate = formula_of(problem, "cost_rate")
     stage_cost, terminal = formula_of(problem, "stage_cost"), formula_of(problem, "terminal_cost")
+    holds = (problem.get("local_controller") or {}).get("kind") == "hold"
     widths, states = [a.width for a in axes], [a.name for a in axes]
 
     def where(place: list[float], final: bool) -> int | str | None:
         cell = cell_of_image(axes, place, clip and final)
         if cell is None:
             return None if clip and not final else "escaped"
-        if cell in Z or cell in A:
-            return "escaped" if cell in Z else "absorbed"
+        if cell in Z:
+            return "escaped"
+        if cell in A and (final or not holds):
+            return "absorbed"
         return cell if final else None
 
     def at_end(place: list[float], final: bool) -> int | str | None:

@@ -9,6 +9,7 @@ from lmdsl.machine.forking import cached_property
 from lmdsl.model.assembly.paths.judging import PathJudge
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
+from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.runge_kutta import RungeKutta
 
@@ -51,7 +52,8 @@ class Quadrature:
         step = self.flow.h * self.flow.substeps
         flow = RungeKutta(self.flow.field, self.flow.states, step, substeps)
         endpoint = self.problem.judged == "endpoint"
-        return PathJudge(flow, self.partition, self.sets, endpoint)
+        absorb = absorbed_on_way(self.problem.local_controller)
+        return PathJudge(flow, self.partition, self.sets, endpoint, absorb)
 
     @cached_property
     def halving(self) -> float:
