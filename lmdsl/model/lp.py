@@ -24,13 +24,12 @@ from lmdsl.model import algorithm_1, stabilizable_set
 from lmdsl.model.assembly.estimates import require_least, unless_short
 from lmdsl.model.assembly.substeps import settled
 from lmdsl.model.assembly.transitions import assemble
-from lmdsl.model.digest import digest_of
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.directions import Directions
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local import holding
 from lmdsl.model.local.controller import LocalController
-from lmdsl.model.rows import RowArrays, Rows
+from lmdsl.model.rows import RowArrays, Rows, digest_of
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.successors.survival import Successors
@@ -226,7 +225,10 @@ class StabilizationLP(Frozen):
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the compiled model: statuses, pairs, exact transitions, costs, gamma, m."""
-        return digest_of(self)
+        before = (self.cell_status, "<u1"), (self.pair_pointer, "<i8"), (self.control, "<i4")
+        after = (self.cost, "<f8"), (self.weight, "<f8"), (self.controls, "<f8")
+        hold = () if self.hold is None else ((self.hold, "<i4"),)
+        return digest_of(self.rows, self.gamma, before, (*after, *hold))
 
     def expand(self, values: NDArray[Any], attractor: Any, outside: Any) -> NDArray[Any]:
         """Spread values on C over all N cells."""

@@ -11,9 +11,10 @@ entry, 0 there. With a discount the end of the run is the same target, by a code
 row sums to exactly 1 with it.
 """
 
+import hashlib
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any, NamedTuple, Self
@@ -245,3 +246,19 @@ def code_type(codes: int) -> type[np.unsignedinteger]:
     if codes <= 2**8:
         return np.uint8
     return np.uint16 if codes <= 2**16 else np.uint32
+
+
+Typed = tuple[NDArray[Any], str]  # an array, and as what its entries count
+
+
+def digest_of(rows: Rows, gamma: float, before: Iterable[Typed], after: Iterable[Typed]) -> str:
+    """Return the SHA-256 of a model: gamma, and the rows between arrays of the pairs."""
+    sha, shares = hashlib.sha256(b"lmdsl model 1\n"), rows.shares
+    below = [*shares.denominator] if shares.total is None else shares.total
+    sha.update(repr((below, [*shares.numerator])).encode())
+    sha.update(np.array([gamma], dtype="<f8").tobytes())
+    own = (rows.pointer, "<i8"), (rows.target, "<i4"), (rows.code, "<u4")
+    for array, kind in (*before, *own, *after):
+        for part in np.array_split(array.ravel(), max(1, array.size // 2**22)):
+            sha.update(np.ascontiguousarray(part, dtype=kind).tobytes())
+    return sha.hexdigest()
