@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lmdsl.backends import Backend, Solution
 from lmdsl.certificate import judge
@@ -169,10 +170,7 @@ class _Job:
     ) -> Result:
         lp = self.lp
         w = witness.w if witness.refusal is None else witness.refusal
-        index = np.full(lp.partition.size, -1, dtype=np.int32)
-        if witness.policy is not None:
-            index[lp.cells] = lp.control[witness.policy]
-            index = index if lp.hold is None else np.maximum(index, lp.hold)
+        index = _controls(lp, witness)
         solved = status != Status.NOT_STABILIZABLE
         attractor = lp.cell_status == CellStatus.ATTRACTOR
         local = check_of(lp, self.finish)
@@ -213,6 +211,15 @@ class _Job:
             lp=lp,
             **more,
         )
+
+
+def _controls(lp: StabilizationLP, witness: Witness) -> NDArray[np.int32]:
+    """Return the control of every cell, -1 where there is none."""
+    index = np.full(lp.partition.size, -1, dtype=np.int32)
+    if witness.policy is not None:
+        index[lp.cells] = lp.control[witness.policy]
+        index = index if lp.hold is None else np.maximum(index, lp.hold)
+    return index
 
 
 def _together(*notes: str) -> str:
