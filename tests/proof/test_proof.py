@@ -108,6 +108,28 @@ def test_a_state_just_below_an_edge_belongs_to_the_cell_above():
     assert (whole != 0).any()
 
 
+def test_what_rounding_does_is_not_overlooked():
+    """The sum with 2^52 rounds x to 0 or 1: f(0.6) = 0.3, though F(0.6) = 0.22 is in A."""
+    data = line("0.1 + 0.2*((x + 4503599627370496) - 4503599627370496)", cells=4)
+    data["system"]["next"]["x"] = f"where(x < 0.5, 0, {data['system']['next']['x']})"
+    result, proof = proved(data, target=0.99)
+    for x in (0.51, 0.6, 0.7, 0.74):
+        b = box_at(proof, result.partition, np.array([x]))
+        assert proof.kind[b] == 0 or proof.level[b] == 2
+    assert exceptions(result, proof, 2000) == {"arrives": 0, "lost": 0, "stays": 0}
+
+
+def test_paths_of_many_substeps_are_enclosed_a_few_boxes_at_a_time():
+    """x' = -x, 1,000 substeps: what x' = -x does in one."""
+    data = line("0", cells=16)
+    data["system"] = {"kind": "ode", "derivative": {"x": "-x"}, "step": 0.5, "substeps": 1000}
+    _, many = proved(data)
+    data["system"]["substeps"] = 1
+    _, one = proved(data)
+    assert many.arrives == one.arrives == 1
+    assert many.steps == one.steps
+
+
 def test_clipped_images_are_never_out():
     data = line("where(x > 0.9, 2, x - 0.25)", on_exit="clip")
     _, proof = proved(data, target=0.866)

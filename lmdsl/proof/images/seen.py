@@ -14,7 +14,8 @@ from lmdsl.problem.problem import Problem
 from lmdsl.proof.images import enclosing, places, tapes
 from lmdsl.proof.images.pieces import DEEPEST, Integers, Pieces, pieces
 
-SOME = 2**13  # boxes enclosed at a time by a thread
+SOME = 2**13  # most boxes enclosed at a time by a thread
+KEPT = 2**22  # doubles of paths above which fewer boxes are enclosed at a time
 
 
 class Seen(NamedTuple):
@@ -71,10 +72,12 @@ class BoxImages:
 
     def __call__(self, cell: Integers, split: Integers, place: Integers) -> Seen:
         """Return what is known of the images of nodes; several threads work."""
-        starts = range(0, len(cell), SOME)
+        arcs = 2 * self.partition.dimension * self.step.substeps
+        size = max(64, min(SOME, KEPT // arcs))
+        starts = range(0, len(cell), size)
 
         def some(start: int) -> Seen:
-            at = slice(start, start + SOME)
+            at = slice(start, start + size)
             return self.part(cell[at], split[at], place[at])
 
         if len(starts) <= 1:
