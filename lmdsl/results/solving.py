@@ -127,8 +127,8 @@ def _answer(lp: StabilizationLP, request: _Request, compile_seconds: float | Non
     """Find a policy of a compiled problem, and the proof of it or against any."""
     deadline = request.deadline
     job = _Job(lp, request.name, request.tolerance, compile_seconds)
-    refused = _not_stabilizable(lp, request.require_all)
     job.finish = deadline.again()
+    refused = _not_stabilizable(lp, request.require_all, job.finish)
     if refused:
         return job.refused(*refused)
     started = time.perf_counter()
@@ -204,10 +204,12 @@ def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:
         inputs.whole(max_iterations, "max_iterations", most=math.inf)
 
 
-def _not_stabilizable(lp: StabilizationLP, require_all: bool) -> tuple[Cause, str] | None:
+def _not_stabilizable(
+    lp: StabilizationLP, require_all: bool, deadline: Deadline
+) -> tuple[Cause, str] | None:
     """Return the cause and a sentence where the graph alone rules the problem out."""
     if holding.none_holds(lp.hold):
-        return Cause.HOLD, holding.why_none(lp.problem, lp.partition)
+        return Cause.HOLD, holding.why_none(lp.problem, lp.partition, deadline)
     if not lp.n:
         if not np.isin(lp.cell_status, LOST).any():
             return Cause.EMPTY, "every cell is attractor or avoid; there is nothing to stabilize"

@@ -96,6 +96,15 @@ def test_no_cell_that_holds_is_a_refusal_that_says_why(tmp_path):
     assert "too coarse" in coarse.message
 
 
+def test_where_the_middles_cannot_be_looked_at_the_refusal_stands():
+    # The cost is negative at the middles only, which no declared sample is.
+    problem = line("x + 0.6*where(x < 0.5, 1, -1)", sampling={"kind": "random", "points": 1})
+    problem["stage_cost"] = "where(abs(mod(10*x, 1) - 0.5) < 1e-6, -1, 1)"
+    result = lm.solve(parse_problem({**problem, "on_exit": "clip"}))
+    assert result.cause == "hold"
+    assert "no attractor cell holds" in result.message
+
+
 @pytest.mark.parametrize("key", ["control", "orbit"])
 def test_bad_input(key):
     with pytest.raises(BadInput, match=rf"local_controller.{key}"):

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from lmdsl.common.records import Frozen
 from lmdsl.common.types import Bools, Floats, Indices, Statuses
-from lmdsl.machine.deadline import Deadline
+from lmdsl.errors import BadInput
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.transitions import Transitions, assemble
 from lmdsl.model.discretization import control_vectors
@@ -143,11 +144,13 @@ def _cheapest(transitions: Transitions, alive: Bools) -> Controls:
 
 def why_none(problem: Problem, partition: Partition, deadline: Deadline | None = None) -> str:
     """Return why no attractor cell holds, and what to do, as far as a look at the middles tells."""
-    sets = CellSets.of(problem, partition, deadline)
-    middles = problem.replaced(sampling={"kind": "grid", "per_axis": 1}, successors="sampled")
-    found = held(middles, partition, sets, deadline)
-    kept = 0 if found is None else int((found >= 0).sum())
     said = "no attractor cell holds: under every control some successors leave the set; "
+    middles = problem.replaced(sampling={"kind": "grid", "per_axis": 1}, successors="sampled")
+    try:
+        found = held(middles, partition, CellSets.of(problem, partition, deadline), deadline)
+    except (BadInput, TimeLimitReached):  # a cost that is refused there, or no time to look
+        return said + "use more cells, a larger attractor, or a shorter step"
+    kept = 0 if found is None else int((found >= 0).sum())
     if kept:
         return said + (
             f"the cells are too coarse (the middles of {kept} of them can be kept, whole cells "
