@@ -28,19 +28,26 @@ and a refusal with
   6 refusal       w >= 0, w != 0 and w <= gamma P_a w for ALL pairs a: no policy has a finite
                   weighted occupation from the cells with w > 0
 
-Everything is decided with rational numbers. Exit status: 0 if every claim holds, 1 if one fails, 2
-if the file is no certificate. What is not checked here: that this process is the model of some
-problem (`lmdsl verify` recompiles it; model_sha256 names it).
+Where the head says what the map is (`map`), a policy also comes with
+
+  7 safe          no run of the map itself from C is lost: see claim_7/judge.py beside this file
+
+Claims 1 to 6 are decided with rational numbers, claim 7 in arithmetic rounded outward. Exit
+status: 0 if every claim holds, 1 if one fails, 2 if the file is no certificate. What is not checked
+here: that this process, or this map, is that of some problem (`lmdsl verify` recompiles it;
+model_sha256 names it).
 """
 
 import json
 import math
+import os
 import sys
 from decimal import Decimal
 from fractions import Fraction
 
 FINE = Fraction(1, 2**4000)
-NAMES = {1: "stabilizing", 2: "upper bound", 3: "lower bound", 4: "measure", 5: "gap", 6: "refusal"}
+NAMES = {1: "stabilizing", 2: "upper bound", 3: "lower bound", 4: "measure", 5: "gap", 6: "refusal",
+         7: "safe"}  # fmt: skip
 
 
 def need(condition, message):
@@ -95,6 +102,12 @@ def check(lines):
     refusal = head["kind"] == "refusal"
     judge = check_refusal if refusal else check_policy
     verdict, numbers = judge(head, cells, pairs, Fraction(gamma))
+    if "map" in head and not refusal:
+        sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+        from claim_7 import judge as safety
+
+        verdict[7], said = safety.check(head["map"], cells)
+        numbers += said
     return verdict, [*numbers, *(f"assumed: {head[key]!a}" for key in head if key == "assumes")]
 
 

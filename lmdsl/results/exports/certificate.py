@@ -19,6 +19,7 @@ from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory.writing import refuse_own_file
+from lmdsl.results.exports.true_map import described
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 
@@ -99,6 +100,8 @@ def _head(result: Result, lp: StabilizationLP, refused: bool) -> dict[str, Any]:
         for name in ("tolerance", "cost", "lower_bound", "contraction"):
             value = getattr(result, name)
             head[name] = None if value is None else float(value).hex()
+        if lp.problem.successors == "enclosed":
+            head["map"] = described(lp)
     return head
 
 
