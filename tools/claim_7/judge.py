@@ -3,7 +3,7 @@
 It is proved of every cell i of C: whatever state a run holds that is located in cell i, and
 whatever noise is covered, the map as computed leads under the control of cell i into a cell of C or
 of the attractor A; where the path of a differential equation is judged, on a path that stays in the
-box outside the avoided cells, up to an end of an arc in A. All that is said of the map is written
+box outside the avoided cells, up to a part of it in A. All that is said of the map is written
 in `map` of the head:
 
   states, controls, noise   names, in order
@@ -27,13 +27,30 @@ import math
 import sys
 
 from claim_7.axes import Axis
-from claim_7.intervals import UNDEFINED, Unclear, down, hull, minus, most, up
+from claim_7.intervals import UNDEFINED, Unclear, down, hull, least, minus, most, up
 from claim_7.jets import Jet, add, constant, enclosure
 from claim_7.true_map import TrueMap, bernstein, combined
 
-MOST = 2**11  # boxes of a cell and a part of the noise after which nothing is claimed of it
+MOST = 2**9  # boxes of a cell and a part of the noise after which nothing is claimed of it
 LARGE = 10**6  # cells of a range above which it is not looked at
 ROUNDING = 2.0**-46  # relative to an arc: more than rounds in a point of it that is computed
+
+NEAR = (1 - 1e-12, 1 + 1e-12)  # more than rounds in the number of parts into which arcs are cut
+
+
+def judged_within(s, e, fewest, largest):
+    """Return whether a step surely ends where its path is in A from s to e of an arc.
+
+    An arc is judged at the ends of q equal parts, q twice its steepest slope at an end of an arc in
+    cells, rounded up: between ``fewest`` and ``largest``.
+    """
+    return e == 1 or (
+        largest <= 1000
+        and all(
+            math.floor(e * q - 1e-9) >= max(1, math.ceil(s * q + 1e-9))
+            for q in range(fewest, largest + 1)
+        )
+    )
 
 
 class Judge:
@@ -150,19 +167,21 @@ class Judge:
 
     def _along(self, arcs, central, away, start):
         """Judge a path: True where it surely ends in A, False where it may be lost, else None."""
+        slopes = [list(zip(self.axes, arc[k], strict=True)) for arc in arcs for k in (1, 2)]
+        steep = (max(f(m.ends) / a.width for slope in slopes for a, m in slope)
+                 for f in (least, most))  # fmt: skip
+        fewest, largest = (max(1, math.ceil(2 * x * c)) for x, c in zip(steep, NEAR, strict=True))
         for number, (arc, middle) in enumerate(zip(arcs, central, strict=True)):
-            way = arc[3]
-            far = max(most(w.ends) / a.width for w, a in zip(way, self.axes, strict=True))
-            count = max(1, min(8, math.ceil(2 * far)))
+            far = max(most(w.ends) / axis.width for axis, w in zip(self.axes, arc[3], strict=True))
+            count = max(1, min(8, math.ceil(2 * far) + 1))
             for j in range(count):
-                points = list(bernstein(j / count, (j + 1) / count))
+                s, e = j / count, (j + 1) / count
                 begins = start if number == 0 and j == 0 else None
-                ranges = self._stretch(points, arc, middle, away, begins)
+                ranges = self._stretch(list(bernstein(s, e)), arc, middle, away, begins)
                 if self._meets(ranges, self.avoid):
                     return False
-            # The end of an arc is always judged: there, at the latest, the step ends.
-            if self._inside(ranges, self.attractor):
-                return True
+                if self._inside(ranges, self.attractor) and judged_within(s, e, fewest, largest):
+                    return True
         return None
 
     def _stretch(self, points, arc, middle, away, start):
