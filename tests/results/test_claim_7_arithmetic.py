@@ -199,7 +199,7 @@ def the_rounding_problem():
     )
     return {
         "states": ["x"], "controls": [], "noise": [], "formulas": [text], "let": {},
-        "parameters": {}, "ode": None, "clip": False, "admissible": None,
+        "parameters": {}, "ode": None, "ends_on_path": True, "clip": False, "admissible": None,
         "axes": [[(0.0).hex(), (10.0).hex(), 10, False]], "attractor": [], "avoid": [],
         "control_vectors": [[]], "noise_parts": [[]],
     }  # fmt: skip

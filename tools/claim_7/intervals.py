@@ -14,6 +14,7 @@ WIDER = 9 * 2.0**-52  # relative; a unit in the last place is at most 2^-52 of a
 TINY = 1e-300  # more than is lost to numbers below the normal ones
 HALF = 2.0**-53  # relative error of a correctly rounded operation
 UP = 1 + 1e-12  # more than some operations on bounds of errors lose
+ZERO = (0.0, 0.0)
 UNDEFINED = (ArithmeticError, ValueError)
 
 
@@ -43,6 +44,8 @@ def least(a):
 
 def plus(a, b):
     """Return a + b."""
+    if a == ZERO or b == ZERO:  # exact: what does not move stays in its cell
+        return b if a == ZERO else a
     return down(a[0] + b[0]), up(a[1] + b[1])
 
 
@@ -53,6 +56,8 @@ def minus(a, b):
 
 def times(a, b):
     """Return a b."""
+    if a == ZERO or b == ZERO:
+        return ZERO
     corners = a[0] * b[0], a[0] * b[1], a[1] * b[0], a[1] * b[1]
     return down(min(corners)), up(max(corners))
 

@@ -21,6 +21,7 @@ from claim_7.intervals import (
     UNDEFINED,
     UP,
     WIDER,
+    ZERO,
     Unclear,
     down,
     hull,
@@ -34,6 +35,8 @@ from claim_7.intervals import (
     up,
     wider,
 )  # fmt: skip
+
+ROOTED = {"sin", "tan", "asin", "atan", "sinh", "tanh", "sqrt"}  # f(0) = 0, exactly
 
 
 class Jet:
@@ -154,7 +157,8 @@ def general_power(a, b):
 def apply_function(name, a):
     """Return an elementary function of a."""
     values, derivative = FUNCTIONS[name]
-    return chained(a, values(a.ends), derivative)
+    exact = a.ends == ZERO and name in ROOTED
+    return chained(a, ZERO if exact else values(a.ends), derivative)
 
 
 def step(name, a):

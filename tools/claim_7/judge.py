@@ -14,6 +14,7 @@ in `map` of the head:
   axes                      by state: [low, high, cells, periodic]; clip: whether images beyond an
                             axis are moved to its end
   attractor, avoid          cells, numbered in C order of the axes
+  ends_on_path              whether a step ends where its path enters A
   control_vectors           by number
   noise_parts               boxes of noise that are covered: [low, high] by variable
   admissible                a condition on states and controls that must hold, or null
@@ -76,7 +77,7 @@ class Judge:
         finite = all(-math.inf < a <= b < math.inf for w in self.noise for a, b in w)
         if not finite or not all(map(math.isfinite, itertools.chain(*self.controls))):
             raise ValueError("a control or the noise is not finite")
-        self.pieces = [{} for _ in self.axes]
+        self.ends, self.pieces = said["ends_on_path"], [{} for _ in self.axes]
         self.boxes = 0
 
     def unproved(self, cell, control):
@@ -180,7 +181,11 @@ class Judge:
                 ranges = self._stretch(list(bernstein(s, e)), arc, middle, away, begins)
                 if self._meets(ranges, self.avoid):
                     return False
-                if self._inside(ranges, self.attractor) and judged_within(s, e, fewest, largest):
+                if (
+                    self.ends
+                    and self._inside(ranges, self.attractor)
+                    and judged_within(s, e, fewest, largest)
+                ):
                     return True
         return None
 
@@ -191,8 +196,8 @@ class Judge:
             (x, *parts), (c, *centres) = ([y[k] for y in jets] for jets in (arc, middle))
             ways = [(combined(point, parts), combined(point, centres)) for point in points]
             low, high = hull(*(enclosure(add(x, w), add(c, v), away) for w, v in ways))
-            slack = ROUNDING * sum(most(y.ends) for y in (x, *parts))
-            place = down(low - slack), up(high + slack)
+            slack = ROUNDING * sum(most(y.ends) for y in parts)
+            place = (down(low - slack), up(high + slack)) if slack else (low, high)
             if start is None:
                 ranges.append(axis.met(*place))
                 continue

@@ -8,7 +8,8 @@ from lmdsl.common.types import Floats
 from lmdsl.formulas.program import Program
 from lmdsl.model.discretization import control_vectors, noise_parts
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.sets import CellSets
+from lmdsl.model.stabilizable_set import sets_of
+from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.runge_kutta import RungeKutta
 
@@ -19,7 +20,7 @@ def described(lp: StabilizationLP) -> dict[str, Any]:
     Doubles are in hexadecimal; formulas are the texts that the problem, or its system, declares.
     """
     problem, partition = lp.problem, lp.partition
-    sets, parts = CellSets.of(problem, partition), np.stack(noise_parts(problem), axis=-1)
+    sets, parts = sets_of(lp.cell_status), np.stack(noise_parts(problem), axis=-1)
     return {
         "states": problem.states,
         "controls": problem.controls,
@@ -34,6 +35,7 @@ def described(lp: StabilizationLP) -> dict[str, Any]:
         ],
         "clip": partition.clip,
         "attractor": np.flatnonzero(sets.attractor).tolist(),
+        "ends_on_path": absorbed_on_way(problem.local_controller),
         "avoid": np.flatnonzero(sets.avoid).tolist(),
         "control_vectors": _hexadecimal(control_vectors(problem)),
         "noise_parts": _hexadecimal(parts),
