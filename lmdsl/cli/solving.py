@@ -165,6 +165,8 @@ def _summary(result: Any) -> str:
             ("contraction", number(result.contraction)),
             ("polish steps", str(result.polish_steps)),
         ]
+    if result.sure_cells is not None:
+        rows.append(("enclosed", _enclosed(result)))
     rows += about
     if result.local_controller:
         rows.append(("local", result.local_controller.sentence()))
@@ -178,6 +180,15 @@ def _summary(result: Any) -> str:
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {value}" for name, value in rows]
     return "\n".join([*lines, "", printable(result.message)])
+
+
+def _enclosed(result: Any) -> str:
+    sure = f"some controller surely arrives from {result.sure_cells} cells"
+    safe = result.claims.get("safe")
+    if safe is None:
+        return sure
+    claim = "no run of the map as compiled is lost (claim 7)" if safe else "claim 7 is not proved"
+    return f"{claim}; {sure}; the lower bound speaks of surviving pairs"
 
 
 def _discount(result: Any) -> str:

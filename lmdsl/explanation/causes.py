@@ -8,13 +8,15 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
-from lmdsl.common.types import Progress, Statuses
+from lmdsl.common.types import Bools, Progress, Statuses
 from lmdsl.errors import BadInput, shown
-from lmdsl.explanation import finite, one_cell
+from lmdsl.explanation import finite, one_cell, whole_cell
 from lmdsl.explanation.changes import every_hint
 from lmdsl.explanation.hints import Hint
 from lmdsl.explanation.lost_mass import PhaseOne
+from lmdsl.explanation.meanings import meanings
 from lmdsl.explanation.one_cell import NAMES, Why
+from lmdsl.explanation.whole_cell import WholeCells
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.surroundings import own_arithmetic
@@ -30,25 +32,6 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.systems import MatrixSystem
-
-MEANING = {
-    CellStatus.ESCAPES: "every control sends some sample out of the box, into avoid, or to "
-    "a value that is not finite",
-    CellStatus.TRAPPED: "A cannot be reached through admissible pairs",
-    CellStatus.LEADS_TO_THESE: "A can be reached, but not without the risk of a cell that is lost",
-}
-
-
-def _meanings(problem: Problem) -> dict[str, str]:
-    """Return what each cause means, by its name."""
-    meaning = dict(MEANING)
-    if isinstance(problem.system, MatrixSystem):
-        meaning[CellStatus.ESCAPES] = finite.escaping(problem)
-    elif problem.admissible is not None:
-        meaning[CellStatus.ESCAPES] += ", or is not admissible at one"
-    if problem.ends_in_time:
-        meaning[CellStatus.LEADS_TO_THESE] = "no control is without the risk of a cell that is lost"
-    return {NAMES[status]: text for status, text in meaning.items()}
 
 
 @dataclass(frozen=True)
@@ -116,6 +99,18 @@ class Explanation(Frozen):
         """The map at the samples of cells."""
         return Sampler(self.problem, self.partition)
 
+    @cached_property
+    def whole_cells(self) -> WholeCells | None:
+        """The enclosures of whole cells; None where pairs survive by their samples."""
+        if self.problem.successors != "enclosed":
+            return None
+        return WholeCells(self.problem, self.partition)
+
+    @cached_property
+    def _admissible(self) -> Bools | None:
+        """Which of the pairs enclosures leave, shape (pairs,); None: all."""
+        return whole_cell.admissible(self.problem, self.partition, self.transitions)
+
     def why(self, cell: int | Mapping[str, float]) -> Why:
         """Return the cause of a cell and its blocking facts.
 
@@ -141,14 +136,14 @@ class Explanation(Frozen):
             if isinstance(self.problem.system, MatrixSystem):
                 moves = finite.moves(self.problem, self.partition, self.cell_status, i)
             else:
-                moves = one_cell.moves(self.sampler, self.cell_status, i)
+                moves = one_cell.moves(self.sampler, self.cell_status, i, self.whole_cells)
             return Why(moves=moves, **known)
         if status != CellStatus.TRAPPED:
             return Why(**known)
         free = self.transitions.sets.free
         start = int(np.searchsorted(free, i))
         pair_pointer, rows = self.transitions.pair_pointer, self.transitions.rows
-        reached = free[one_cell.reachable(pair_pointer, rows, start)]
+        reached = free[one_cell.reachable(pair_pointer, rows, start, self._admissible)]
         mask = np.zeros(p.size, dtype=np.bool_)
         mask[reached] = True
         return Why(
@@ -200,7 +195,7 @@ class Explanation(Frozen):
         stabilizable = int((self.cell_status == CellStatus.STABILIZED).sum())
         lines = [f"{self.lost} of {self.lost + stabilizable} cells outside A and avoid cannot be "
                  "stabilized"]  # fmt: skip
-        meaning = _meanings(self.problem)
+        meaning = meanings(self.problem)
         finite_model = isinstance(self.problem.system, MatrixSystem)
         for cause in self.causes:
             lines += ["", f"{cause.name}, {cause.cells} cells: {meaning[cause.name]}"]
@@ -260,6 +255,8 @@ def explain(
     deadline = Deadline.of(time_limit)
     regions, phase_one = inputs.whole(regions, "regions"), inputs.flag(phase_one, "phase_one")
     assembled = None
+    if phase_one:
+        whole_cell.refuse(problem.problem if isinstance(problem, StabilizationLP) else problem)
     if isinstance(problem, StabilizationLP):
         partition, status = problem.partition, problem.cell_status.copy()
         status[status == CellStatus.BEYOND_GAMMA] = CellStatus.STABILIZED
@@ -269,7 +266,7 @@ def explain(
         problem = settled(problem, deadline)
         partition = Partition.of(problem)
         assembled = assemble(problem, partition, progress, deadline)
-        status = _status(problem, assembled, deadline)
+        status = _status(problem, partition, assembled, deadline)
     if phase_one and assembled is None:
         assembled = assemble(problem, partition, progress, deadline)
     if progress:
@@ -304,16 +301,19 @@ def phase_one(problem: Problem, time_limit: float | Deadline | None = None) -> P
         The LP is not solved.
     """
     deadline = Deadline.of(time_limit)
+    whole_cell.refuse(problem)
     problem = settled(problem, deadline)
     partition = Partition.of(problem)
     assembled = assemble(problem, partition, deadline=deadline)
-    status = _status(problem, assembled, deadline)
+    status = _status(problem, partition, assembled, deadline)
     return PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
 
 
-def _status(problem: Problem, transitions: Transitions, deadline: Deadline) -> Statuses:
+def _status(
+    problem: Problem, partition: Partition, transitions: Transitions, deadline: Deadline
+) -> Statuses:
     """Return the status of every cell, shape (N,)."""
-    found = stabilizable_set.of_problem(problem, transitions, deadline)
+    found = stabilizable_set.of_transitions(problem, partition, transitions, deadline)
     status = stabilizable_set.statuses(transitions, found)
     status.setflags(write=False)
     return status

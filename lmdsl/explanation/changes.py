@@ -6,6 +6,7 @@ periodic axis   the map does not change when a state is moved by the length of i
                 axis declared periodic more can be stabilized.
 box attractor   the attractor is the cells around points: with a box that also has the cells around
                 these, more can be stabilized, and it does not shrink with the cells.
+smaller cells   successors are enclosed, and by their samples more cells can be stabilized.
 
 A hint is given if the share of the cells that can be stabilized rises by at least a tenth, where
 compiling takes a moment. The figures are those of the compilations. Where it takes longer, a longer
@@ -62,6 +63,7 @@ def changes(
     yield from _longer_step(MapTrial(bare, partition, deadline), status, share, deadline)
     yield from _periodic(MapTrial(bare, partition, deadline), share, deadline)
     yield from _box(bare, share, deadline)
+    yield from _smaller_cells(bare, share, deadline)
 
 
 def _gain(share: float, then: float) -> str:
@@ -121,6 +123,33 @@ def _periodic(trial: MapTrial, share: float, deadline: Deadline) -> Iterator[Hin
         )
         numbers = {"axis": name, "period": period, "share": share, "share_then": then}
         yield Hint("periodic axis", text, numbers)
+
+
+def _smaller_cells(problem: Problem, share: float, deadline: Deadline) -> Iterator[Hint]:
+    if problem.successors != "enclosed" or not remedies.cheap(problem, remedies.TRIAL):
+        return
+    sampled = remedies.coverage(problem.replaced(successors=None), deadline).share
+    if sampled <= share:
+        return
+    text = (
+        f"smaller cells: by its samples {100 * sampled:.3g} % of the cells can be stabilized, not "
+        f"{100 * share:.3g} %: the others are kept out by enclosures of whole cells, which are "
+        "narrower on smaller cells and over shorter steps; a finer control grid has more to choose "
+        "from"
+    )
+    numbers: dict[str, Any] = {"share": share, "share_sampled": sampled, "share_then": None}
+    finer = (
+        None
+        if problem.attractor.cells
+        else remedies.with_cells(
+            problem, {name: 2 * axis.cells for name, axis in problem.state_box.items()}
+        )
+    )
+    if finer is not None and remedies.cheap(finer, 4 * remedies.TRIAL):
+        then = remedies.coverage(finer, deadline).share
+        numbers["share_then"] = then
+        text += f"; with twice the cells an axis it is {100 * then:.3g} %"
+    yield Hint("smaller cells", text, numbers)
 
 
 def _box(problem: Problem, share: float, deadline: Deadline) -> Iterator[Hint]:

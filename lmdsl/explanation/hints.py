@@ -53,7 +53,8 @@ class Hint(Reported):
     ----------
     kind
         ``larger box``, ``more controls`` or ``finer grid``; of changes that were compiled
-        (:mod:`lmdsl.explanation.changes`) ``longer step``, ``periodic axis`` or ``box attractor``.
+        (:mod:`lmdsl.explanation.changes`) ``longer step``, ``periodic axis``, ``box attractor`` or
+        ``smaller cells``.
     text
         One sentence.
     numbers

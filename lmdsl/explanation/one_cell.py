@@ -7,6 +7,7 @@ import numpy as np
 
 from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Bools, Indices, Statuses
+from lmdsl.explanation.whole_cell import WholeCells
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.assembly.sampler import Block, Sampler
 from lmdsl.model.assembly.transitions import outcome
@@ -36,7 +37,9 @@ class Move(Frozen):
         ``leaves`` the box, enters ``avoid``, is ``not finite``, is ``not admissible`` (the
         condition of the problem does not hold), or ``enters`` a cell that is not stabilizable; in a
         finite model also ``missing``, the control is not available, and ``escapes``, the row sums
-        to less than 1; of recorded data ``not recorded``, and ``seen to leave`` the box.
+        to less than 1; of recorded data ``not recorded``, and ``seen to leave`` the box. Where no
+        sample is lost but enclosures of the whole cell do not rule it out: ``can leave``,
+        ``can enter avoid``, ``can enter`` such a cell, ``not admissible everywhere``.
     state, noise, image
         The first sample that does so, and where it lands, or is judged on the way; noise is empty
         without noise.
@@ -48,6 +51,9 @@ class Move(Frozen):
         The share of the cell's samples that leave, or if none leaves, that enter such cells.
     given
         The rows were given, not sampled.
+    meets
+        Of what enclosures say: what the image of the whole cell, or its way, can meet, by axis; an
+        axis along which it can leave the box, or be undefined, is not among them.
     """
 
     control: Named
@@ -60,9 +66,12 @@ class Move(Frozen):
     cell: int | None = None
     cause: str | None = None
     given: bool = False
+    meets: Ends | None = None
 
     def __str__(self) -> str:
         control = _shown(self.control)
+        if self.meets is not None or self.kind == "not admissible everywhere":
+            return f"{control or 'it'} loses no sample, but {self._enclosed()}"
         if self.kind == "not admissible":
             at = _shown({**self.state, **self.control})
             return (
@@ -94,6 +103,19 @@ class Move(Frozen):
         if self.kind == "not finite":
             return f"{sample}, which is not finite"
         return f"{sample}, in a cell that is lost ({self.cause})"
+
+    def _enclosed(self) -> str:
+        """Return why enclosures drop the control."""
+        if self.kind == "not admissible everywhere":
+            return "the condition is not shown to hold on the whole cell"
+        assert self.meets is not None
+        if self.kind == "can leave":
+            out = ", ".join(axis for axis, _, _ in self.sides)
+            return f"its enclosure leaves the box along {out}, or may be undefined there"
+        where = f"its enclosure meets {boxes.shown(self.meets)}"
+        if self.kind == "can enter avoid":
+            return f"{where}, and so avoid"
+        return f"{where}, and so a cell that is lost ({self.cause})"
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data."""
@@ -173,14 +195,18 @@ def _count(n: int, noun: str) -> str:
     return f"{n} {noun}{'s' * (n != 1)}"
 
 
-def moves(sampler: Sampler, status: Statuses, cell: int) -> tuple[Move, ...]:
+def moves(
+    sampler: Sampler, status: Statuses, cell: int, whole: WholeCells | None = None
+) -> tuple[Move, ...]:
     """Return what the controls do to a cell that escapes or leads to lost cells."""
     M = len(sampler.controls)
     picked = np.unique(np.linspace(0, M - 1, min(M, MOST_CONTROLS)).round().astype(int))
-    return tuple(_move(sampler, status, cell, int(a)) for a in picked)
+    return tuple(_move(sampler, status, cell, int(a), whole) for a in picked)
 
 
-def _move(sampler: Sampler, status: Statuses, cell: int, control: int) -> Move:
+def _move(
+    sampler: Sampler, status: Statuses, cell: int, control: int, whole: WholeCells | None
+) -> Move:
     p, nodes = sampler.partition, sampler.nodes
     flat = outcome(sampler, cell, control)
     code = np.where(flat < 0, CellStatus.AVOID, status[flat])
@@ -198,12 +224,17 @@ def _move(sampler: Sampler, status: Statuses, cell: int, control: int) -> Move:
         shape = (1, len(sampler.points), len(nodes.weights), 1)
         refused = ~np.broadcast_to(admitted, shape).ravel()
         bad = refused if refused.any() else bad
+    named = dict(zip(sampler.problem.controls, map(float, sampler.controls[control]), strict=True))
+    if whole is not None and not leaving.any() and not refused.any():
+        enclosed = _enclosed(whole, status, cell, control, named, certain=bool(bad.any()))
+        if enclosed is not None:
+            return enclosed
     s = int(np.argmax(bad))
     point, node = divmod(s, len(nodes.weights))
     image = sampler.places(block)[:, s].tolist()
     problem = sampler.problem
     found: dict[str, Any] = {
-        "control": dict(zip(problem.controls, map(float, sampler.controls[control]), strict=True)),
+        "control": named,
         "state": {name: float(values[name][0, point, 0, 0]) for name in problem.states},
         "noise": {name: float(nodes.values[node, k]) for k, name in enumerate(problem.noises)},
         "image": dict(zip(problem.states, image, strict=True)),
@@ -220,6 +251,18 @@ def _move(sampler: Sampler, status: Statuses, cell: int, control: int) -> Move:
     return Move(kind="leaves", sides=_sides(p, image), **found)
 
 
+def _enclosed(
+    whole: WholeCells, status: Statuses, cell: int, control: int, named: Named, certain: bool
+) -> Move | None:
+    """Return why enclosures drop a control; None where they do not, or samples are ``certain``."""
+    doubt = whole.inadmissible(cell, control) if certain else whole.lost(cell, control, status)
+    if doubt is None:
+        return None
+    cause = None if doubt.cell is None else NAMES[CellStatus(status[doubt.cell])]
+    sides = tuple((axis, "", 0.0) for axis in doubt.out)
+    return Move(named, doubt.kind, {}, {}, {}, 0.0, sides, doubt.cell, cause, meets=doubt.meets)
+
+
 def _sides(p: Partition, image: list[float]) -> tuple[tuple[str, str, float], ...]:
     found = []
     for k, x in enumerate(image):
@@ -229,18 +272,21 @@ def _sides(p: Partition, image: list[float]) -> tuple[tuple[str, str, float], ..
     return tuple(found)
 
 
-def reachable(pair_pointer: Indices, rows: Rows, start: int) -> Bools:
+def reachable(
+    pair_pointer: Indices, rows: Rows, start: int, admissible: Bools | None = None
+) -> Bools:
     """Return the free cells that runs from one of them can reach, the start included, (F,).
 
     It is the smallest set that contains the start and that no admissible pair leaves (but into A).
     """
     seen = np.zeros(rows.columns + 1, dtype=np.bool_)
-    _reach(pair_pointer, rows.pointer, rows.target, start, seen)
+    allowed = np.ones(rows.count, dtype=np.bool_) if admissible is None else admissible
+    _reach(pair_pointer, rows.pointer, rows.target, allowed, start, seen)
     return seen[:-1]
 
 
 @kernel(allocates=True)
-def _reach(pair_pointer, pointer, target, start, seen):  # type: ignore[no-untyped-def]
+def _reach(pair_pointer, pointer, target, allowed, start, seen):  # type: ignore[no-untyped-def]
     queue = np.empty(len(seen), dtype=np.int64)
     queue[0], end, at = start, 1, 0
     seen[start] = True
@@ -249,9 +295,11 @@ def _reach(pair_pointer, pointer, target, start, seen):  # type: ignore[no-untyp
         at += 1
         if i == len(seen) - 1:
             continue
-        for e in range(pointer[pair_pointer[i]], pointer[pair_pointer[i + 1]]):
-            j = target[e]
-            if not seen[j]:
-                seen[j] = True
-                queue[end] = j
-                end += 1
+        for k in range(pair_pointer[i], pair_pointer[i + 1]):
+            if allowed[k]:
+                for e in range(pointer[k], pointer[k + 1]):
+                    j = target[e]
+                    if not seen[j]:
+                        seen[j] = True
+                        queue[end] = j
+                        end += 1

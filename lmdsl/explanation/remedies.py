@@ -56,8 +56,9 @@ def coverage(problem: Problem, deadline: Deadline | None = None) -> Stabilizable
     # A deadline of its own: a fault cancels it, and who asks goes on with other problems.
     deadline = None if deadline is None else Deadline(deadline.left)
     problem = settled(problem, deadline)
-    transitions = assemble(problem, Partition.of(problem), deadline=deadline)
-    found = stabilizable_set.of_problem(problem, transitions, deadline)
+    partition = Partition.of(problem)
+    transitions = assemble(problem, partition, deadline=deadline)
+    found = stabilizable_set.of_transitions(problem, partition, transitions, deadline)
     return StabilizableShare(int(found.inside.sum()), len(found.inside))
 
 

@@ -28,6 +28,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.algorithm_1 import Predecessors, owner, tree
 from lmdsl.model.assembly.transitions import Transitions
+from lmdsl.model.grid.partition import Partition
 from lmdsl.model.rows import Rows
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors.survival import Successors
@@ -133,6 +134,18 @@ def of_problem(
     """
     rows = transitions.rows if problem.ends_in_time else transitions.rows.without_end()
     return stabilizable(transitions.pair_pointer, rows, deadline, successors)
+
+
+def of_transitions(
+    problem: Problem,
+    partition: Partition,
+    transitions: Transitions,
+    deadline: Deadline | None = None,
+) -> Stabilizable:
+    """Return the stabilizable set of a problem, with enclosed successors where it asks for them."""
+    deadline = Deadline.of(deadline)
+    successors = Successors.asked_for(problem, partition, transitions, deadline)
+    return of_problem(problem, transitions, deadline, successors)
 
 
 def statuses(transitions: Transitions, found: Stabilizable) -> Statuses:

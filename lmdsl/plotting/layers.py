@@ -21,7 +21,7 @@ from lmdsl.plotting.view import View, number, rectangles
 DECADES, DEEPEST = 2, 8
 
 INK, FAINT, HATCH = "#222222", "#999999", "#8c8c8c"
-ATTRACTOR = "#ff2fa0"
+ATTRACTOR, SURE = "#ff2fa0", "#ff8c00"
 CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
 UNSOLVED, INFINITE = 7, int(CellStatus.BEYOND_GAMMA)
 # Region: name, colour, hatch; greys are cells that cannot be stabilized, by cause.
@@ -116,7 +116,9 @@ def region(ax: Any, view: View, mask: Bools, code: int, upright: bool = True) ->
     return patch
 
 
-def outline(ax: Any, view: View, mask: Bools, colour: str, width: float = 0.9) -> None:
+def outline(
+    ax: Any, view: View, mask: Bools, colour: str, width: float = 0.9, rings: bool = True
+) -> None:
     """Outline the attractor, and ring its parts that are too small to see."""
     from matplotlib.collections import LineCollection
     from scipy.ndimage import find_objects, label
@@ -129,7 +131,7 @@ def outline(ax: Any, view: View, mask: Bools, colour: str, width: float = 0.9) -
     level = np.stack([np.stack([x[i], y[j]], -1), np.stack([x[i + 1], y[j]], -1)], 1)
     lines: Any = np.concatenate([upright, level])
     ax.add_collection(LineCollection(lines, colors=colour, linewidths=width, zorder=3.1))
-    for part in find_objects(label(mask)[0])[:100]:
+    for part in find_objects(label(mask)[0])[:100] if rings else ():
         if all((q.stop - q.start) < 0.03 * n for q, n in zip(part, mask.shape, strict=True)):
             centre = [(e[q.start] + e[q.stop]) / 2 for e, q in zip((x, y), part, strict=True)]
             for ink, size in (("white", 2.4), (ATTRACTOR, 1.3)):
@@ -169,10 +171,20 @@ def frames(ax: Any, view: View, boxes: Sequence[Mapping[str, tuple[float, float]
 
 
 def regions(
-    ax: Any, view: View, code: NDArray[np.integer], legend: bool, upright: bool = True
+    ax: Any,
+    view: View,
+    code: NDArray[np.integer],
+    legend: bool,
+    upright: bool = True,
+    sure: Bools | None = None,
 ) -> None:
-    """Fill every region of a slice: the attractor, and by cause what is not stabilized."""
+    """Fill every region of a slice: the attractor, and by cause what is not stabilized.
+
+    ``sure`` are the cells around which a line runs: from them some controller surely arrives.
+    """
     handles = [region(ax, view, code == k, k, upright) for k in REGIONS if (code == k).any()]
+    if sure is not None and sure.any():
+        handles.append(_around(ax, view, sure))
     if len(view.axes) == 2:
         outline(ax, view, code == CellStatus.ATTRACTOR, "white")
     if not legend or not handles:
@@ -193,6 +205,21 @@ def regions(
         borderpad=0,
         borderaxespad=0,
     )
+
+
+def _around(ax: Any, view: View, mask: Bools) -> Any:
+    """Draw a line around cells, in one dimension below them; return its legend handle."""
+    from matplotlib.lines import Line2D
+
+    line: dict[str, Any] = {"color": SURE, "linewidth": 2.2}
+    if len(view.axes) == 2:
+        outline(ax, view, mask, SURE, 1.6, rings=False)
+    else:
+        for box in rectangles(mask[:, None], view.edges(0), np.array([0.0, 1.0])):
+            ax.plot(
+                box[:2, 0], [0.012, 0.012], transform=ax.get_xaxis_transform(), zorder=3, **line
+            )
+    return Line2D([], [], label="surely arrives", **line)
 
 
 def scalar(ax: Any, view: View, values: Floats, label: str, colours: str) -> None:

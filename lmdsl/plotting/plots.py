@@ -115,7 +115,8 @@ def cost(
 ) -> Axes:
     """Draw the cost-to-go V over the cells, the attractor, and by cause what has no control.
 
-    Colours are logarithmic when V spans more than two decades.
+    Colours are logarithmic when V spans more than two decades. Where successors are enclosed, a
+    line runs around the cells from which some controller surely arrives.
 
     Parameters
     ----------
@@ -140,7 +141,9 @@ def cost(
     value = view.slice(_on_stabilized(result, result.value))
     if np.isfinite(value).any():
         layers.scalar(drawn, view, value, "cost-to-go V", "viridis")
-    layers.regions(drawn, view, view.slice(_codes(result)), legend)
+    levels = result.sure_levels
+    sure = None if levels is None else view.slice(levels > 0)
+    layers.regions(drawn, view, view.slice(_codes(result)), legend, sure=sure)
     return drawn
 
 

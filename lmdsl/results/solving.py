@@ -81,6 +81,8 @@ def solve(
     _check_options(problem, tolerance, max_iterations)
     require_all = inputs.flag(require_all, "require_all")
     restrict_to_gamma = inputs.flag(restrict_to_gamma, "restrict_to_gamma")
+    if restrict_to_gamma:
+        _no_enclosures(problem if isinstance(problem, Problem) else problem.problem)
     chosen, algorithm = backends.resolve(backend)
     request = _Request(
         backend=chosen,
@@ -204,6 +206,16 @@ def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:
         inputs.whole(max_iterations, "max_iterations", most=math.inf)
 
 
+def _no_enclosures(problem: Problem) -> None:
+    """Refuse to leave out cells that runs of the map, not of its samples, may enter."""
+    if problem.successors == "enclosed":
+        raise BadInput(
+            "successors are enclosed: what cells left out can still be met from others is not "
+            'known on the smaller model; lower gamma, or use "successors": "sampled"',
+            "restrict_to_gamma",
+        )
+
+
 def _not_stabilizable(
     lp: StabilizationLP, require_all: bool, deadline: Deadline
 ) -> tuple[Cause, str] | None:
@@ -211,11 +223,16 @@ def _not_stabilizable(
     if holding.none_holds(lp.hold):
         return Cause.HOLD, holding.why_none(lp.problem, lp.partition, deadline)
     if not lp.n:
+        enclosed = lp.problem.successors == "enclosed"
         if not np.isin(lp.cell_status, LOST).any():
             return Cause.EMPTY, "every cell is attractor or avoid; there is nothing to stabilize"
         if lp.problem.attractor.empty:
             return Cause.EMPTY, _nothing_to_end_in(lp.problem)
-        return Cause.EMPTY, "no cell can be kept in the box and brought to the attractor"
+        sentence = "no cell can be kept in the box and brought to the attractor"
+        return Cause.EMPTY, sentence + enclosed * (
+            ", as far as enclosures of whole cells show; smaller cells or a finer control grid may "
+            "do it (lmdsl explain)"
+        )
     if not lp.weight.any():
         return Cause.MEASURE, "no cell of measure is stabilizable; enlarge its boxes"
     given = np.isin(lp.cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID))

@@ -26,7 +26,7 @@ def refusal_message(
     limiting = limits.limiting
     if limiting is not None and len(limiting) != len(cells):
         parts.append(f"gamma_bar is limited by {_counted(limiting)}")
-    if left:
+    if left and lp.problem.successors != "enclosed":
         parts.append(
             "this corner limits gamma_bar for all; lower gamma, or solve on the other "
             f"{left} cells with --restrict-to-gamma (restrict_to_gamma=True)"

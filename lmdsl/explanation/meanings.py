@@ -1,0 +1,30 @@
+"""What the causes mean, in words, by what a problem asks for."""
+
+from lmdsl.explanation import finite
+from lmdsl.explanation.one_cell import NAMES
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.problem.problem import Problem
+from lmdsl.systems import MatrixSystem
+
+MEANING = {
+    CellStatus.ESCAPES: "every control sends some sample out of the box, into avoid, or to "
+    "a value that is not finite",
+    CellStatus.TRAPPED: "A cannot be reached through admissible pairs",
+    CellStatus.LEADS_TO_THESE: "A can be reached, but not without the risk of a cell that is lost",
+}
+
+
+def meanings(problem: Problem) -> dict[str, str]:
+    """Return what each cause means, by its name."""
+    meaning = dict(MEANING)
+    if isinstance(problem.system, MatrixSystem):
+        meaning[CellStatus.ESCAPES] = finite.escaping(problem)
+    elif problem.admissible is not None:
+        meaning[CellStatus.ESCAPES] += ", or is not admissible at one"
+    if problem.successors == "enclosed":
+        meaning[CellStatus.ESCAPES] = (
+            "of no control enclosures show that all of the cell stays in the box and outside avoid"
+        )
+    if problem.ends_in_time:
+        meaning[CellStatus.LEADS_TO_THESE] = "no control is without the risk of a cell that is lost"
+    return {NAMES[status]: text for status, text in meaning.items()}
