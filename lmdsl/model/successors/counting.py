@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools
+from lmdsl.common.types import Bools, Guard
 from lmdsl.machine import memory
 from lmdsl.machine.kernels import fixed, kernel
 from lmdsl.model.grid.partition import Partition
@@ -36,8 +36,8 @@ class Table(NamedTuple):
     stride: NDArray[np.int64]
 
 
-def table(cells: Bools, partition: Partition) -> Table:
-    """Return the table of a set of cells, a mask of shape (N,)."""
+def table(cells: Bools, partition: Partition, guard: Guard | None = None) -> Table:
+    """Return the table of a set of cells, a mask of shape (N,); it can be far larger than that."""
     d, marked = partition.dimension, cells.reshape(partition.shape)
     lengths = [n * (2 if p else 1) for n, p in zip(marked.shape, partition.periodic, strict=True)]
     memory.require(16 * float(np.prod([n + 1.0 for n in lengths])), "sums over the cells")
@@ -45,6 +45,8 @@ def table(cells: Bools, partition: Partition) -> Table:
     sums = np.zeros([n + 1 for n in lengths], dtype=np.int64)
     sums[(slice(1, None),) * d] = marked
     for k in range(d):
+        if guard:
+            guard()
         np.cumsum(sums, axis=k, out=sums)
     corner = (np.arange(2**d)[:, None] >> np.arange(d)) & 1
     sign = np.where((d - corner.sum(axis=1)) % 2, -1, 1).astype(np.int64)

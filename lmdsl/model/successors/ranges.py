@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Indices, Progress
+from lmdsl.common.types import Bools, Guard, Indices, Progress
 from lmdsl.machine import memory, threads
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid.partition import Partition
@@ -52,13 +52,15 @@ class PathTables(NamedTuple):
     absorbed: Indices  # multi-index of a cell of A, shape (d,)
 
     @classmethod
-    def of(cls, problem: Problem, sets: CellSets, partition: Partition) -> "PathTables":
+    def of(
+        cls, problem: Problem, sets: CellSets, partition: Partition, guard: Guard | None = None
+    ) -> "PathTables":
         """Return the tables of the sets of a problem."""
         some = int(np.argmax(sets.attractor))
         absorbs = absorbed_on_way(problem.local_controller)
         return cls(
-            counting.table(sets.avoid, partition),
-            counting.table(sets.attractor & absorbs, partition),
+            counting.table(sets.avoid, partition, guard),
+            counting.table(sets.attractor & absorbs, partition, guard),
             np.array([int(k[0]) for k in partition.multi_index(np.array([some]))]),
         )
 
@@ -82,7 +84,8 @@ def enclosed(
     deadline, progress
         As for :func:`lmdsl.compile`.
     """
-    grid, judged = Slabs(problem, partition, deadline), PathTables.of(problem, sets, partition)
+    grid = Slabs(problem, partition, deadline)
+    judged = PathTables.of(problem, sets, partition, grid.guard)
     cell, control = pairs
     count, parts, d = len(cell), grid.encloser.parts, partition.dimension
     kind = number_type(partition)

@@ -88,9 +88,9 @@ class Successors:
         alive &= ~lost[owner(pointer)]
         choices = self.choices(alive)
         while lost.any():
-            self._deadline.raise_if_over(DOING)
+            self._guard()
             inside &= ~lost
-            removed = table(self._spread(lost), self.partition)
+            removed = table(self._spread(lost), self.partition, self._guard)
             drop(removed, self._reach, fixed(pointer), self._ranges, alive, choices)
             lost = inside & (choices == 0)
 
@@ -103,11 +103,11 @@ class Successors:
         level = np.full(len(sets.free), -1, dtype=np.int32)
         front, below = sets.attractor, 0
         while front.any():
-            self._deadline.raise_if_over(DOING)
+            self._guard()
             chosen = np.zeros(len(level), dtype=np.bool_)
             lift(
-                table(front, self.partition),
-                table(self._spread(level < 0) | sets.avoid, self.partition),
+                table(front, self.partition, self._guard),
+                table(self._spread(level < 0) | sets.avoid, self.partition, self._guard),
                 self._reach, fixed(self.transitions.pair_pointer), self._ranges,
                 fixed(self.admissible), fixed(level), chosen,
             )  # fmt: skip
@@ -118,6 +118,9 @@ class Successors:
         sure[sets.attractor] = 0
         sure[sets.free] = level
         return sure
+
+    def _guard(self) -> None:
+        self._deadline.raise_if_over(DOING)
 
     def _spread(self, marked: Bools) -> Bools:
         """Return marked free cells as cells of the box, shape (N,)."""
