@@ -12,12 +12,11 @@ import pytest
 
 import lmdsl as lm
 from lmdsl.certificate import safety
-from lmdsl.machine.deadline import Deadline, TimeLimitReached
+from lmdsl.machine.deadline import Deadline
 from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.transitions import assemble
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
-from lmdsl.model.successors import counting
 from lmdsl.model.successors.inclusion import Inclusion
 from lmdsl.model.successors.survival import Successors
 from lmdsl.model.true_map import TrueMap
@@ -399,21 +398,3 @@ def test_within_bounds_normal_noise():
         x = partition.centres(cell[[pair]])
         _, reached = partition.enter(0.5 * x + 0.1 * noise)
         assert inside(partition, found, pair, reached).all()
-
-
-def test_sums_over_many_circles_heed_the_limit():
-    """On d circles they have 2^d entries for each cell: tables can be far larger than the model."""
-    names = "abcdfghi"
-    problem = declared(
-        {"kind": "map", "next": {name: f"0.5*{name}" for name in names}},
-        {name: line(-1, 1, 2, periodic=True) for name in names}, {},
-        sampling={"kind": "random", "points": 1},
-    )  # fmt: skip
-    partition = Partition.of(problem)
-    calls = []
-    cells = np.arange(partition.size) % 3 == 0
-    found = counting.table(cells, partition, lambda: calls.append(1))
-    assert len(calls) == partition.dimension
-    assert found.sums[-1] == 2**partition.dimension * cells.sum()
-    with pytest.raises(TimeLimitReached):
-        counting.table(cells, partition, lambda: Deadline(0.0).raise_if_over("here"))
