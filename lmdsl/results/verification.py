@@ -179,6 +179,8 @@ def verify(
         not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
     )
     system = result.problem.system
+    if certificate.safe:
+        return replace(found, scope=f"{found.scope}; safe of the map as compiled")
     return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
 
 

@@ -120,11 +120,13 @@ def test_reports_say_what_is_claimed(tmp_path, capsys):
     assert main(["solve", str(file)]) == 3
     assert "as far as enclosures of whole cells show" in capsys.readouterr().out
     file.write_text(bump().to_json())
-    assert main(["solve", str(file)]) == 0
+    assert main(["solve", str(file), "--out", str(tmp_path / "out")]) == 0
     told = capsys.readouterr().out
     assert "no run of the map as compiled is lost (claim 7)" in told
     assert "some controller surely arrives from 1 cells" in told
     assert "the lower bound speaks of surviving pairs" in told
+    assert main(["verify", str(tmp_path / "out")]) == 0
+    assert "safe of the map as compiled" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("axes", [1, 2])
