@@ -178,10 +178,15 @@ def verify(
     found = Verification(
         not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
     )
-    system = result.problem.system
+    return replace(found, scope=_scope(result, certificate, found.scope))
+
+
+def _scope(result: Result, certificate: Certificate, usual: str) -> str:
+    """Return what the claims speak of."""
     if certificate.safe:
-        return replace(found, scope=f"{found.scope}; safe of the map as compiled")
-    return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
+        return f"{usual}; safe of the map as compiled"
+    system = result.problem.system
+    return system.scope if isinstance(system, MatrixSystem) else usual
 
 
 def _restricted(
