@@ -178,15 +178,12 @@ def verify(
     found = Verification(
         not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
     )
-    return replace(found, scope=_scope(result, certificate, found.scope))
+    return replace(found, scope=_scope(result.problem.system, certificate, found.scope))
 
 
-def _scope(result: Result, certificate: Certificate, usual: str) -> str:
-    """Return what the claims speak of."""
-    if certificate.safe:
-        return f"{usual}; safe of the map as compiled"
-    system = result.problem.system
-    return system.scope if isinstance(system, MatrixSystem) else usual
+def _scope(system: Any, certificate: Certificate, usual: str) -> str:
+    usual += "; safe of the map as compiled" * bool(certificate.safe)
+    return str(system.scope) if isinstance(system, MatrixSystem) else usual
 
 
 def _restricted(
