@@ -104,7 +104,7 @@ class Explanation(Frozen):
         """The enclosures of whole cells; None where pairs survive by their samples."""
         if self.problem.successors != "enclosed":
             return None
-        return WholeCells(self.problem, self.partition)
+        return WholeCells(self.problem, self.partition, self.cell_status)
 
     @cached_property
     def _admissible(self) -> Bools | None:

@@ -11,8 +11,7 @@ from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.grid import boxes
 from lmdsl.model.grid.boxes import Ends
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.sets import CellSets
-from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.stabilizable_set import CellStatus, sets_of
 from lmdsl.model.successors import counting
 from lmdsl.model.successors.ranges import PathTables, taken
 from lmdsl.model.successors.slabs import Slab, Slabs, Span
@@ -61,10 +60,10 @@ class Doubt(NamedTuple):
 class WholeCells:
     """Encloses one pair at a time, as compiling does."""
 
-    def __init__(self, problem: Problem, partition: Partition) -> None:
+    def __init__(self, problem: Problem, partition: Partition, status: Statuses) -> None:
         self.partition = partition
         self._slabs = Slabs(problem, partition, Deadline())
-        self._judged = PathTables.of(CellSets.of(problem, partition), partition)
+        self._judged = PathTables.of(problem, sets_of(status), partition)
 
     def inadmissible(self, cell: int, control: int) -> Doubt | None:
         """Return why a pair is not admissible; None where it is."""
