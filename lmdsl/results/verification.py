@@ -85,7 +85,8 @@ class Verification:
         lines += [f"  {printable(sentence)}" for sentence in (*self.reasons, *self.notes)]
         if proof.assumes:
             lines.append(f"  assumed: {proof.assumes}")
-        return "\n".join([*lines, f"  (claims speak of {self.scope})"])
+        scope = self.scope + "; safe of the map as compiled" * bool(proof.safe)
+        return "\n".join([*lines, f"  (claims speak of {scope})"])
 
     __str__ = text
 
@@ -178,12 +179,8 @@ def verify(
     found = Verification(
         not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
     )
-    return replace(found, scope=_scope(result.problem.system, certificate, found.scope))
-
-
-def _scope(system: Any, certificate: Certificate, usual: str) -> str:
-    usual += "; safe of the map as compiled" * bool(certificate.safe)
-    return str(system.scope) if isinstance(system, MatrixSystem) else usual
+    system = result.problem.system
+    return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
 
 
 def _restricted(
