@@ -49,6 +49,18 @@ def test_what_lmdsl_proves_the_script_proves(name, tmp_path):
     assert said.count("holds") == 6
 
 
+@pytest.mark.parametrize("partial", [False, True])
+def test_attractors_that_hold_are_judged_by_their_cells(partial, tmp_path):
+    hold = {"kind": "hold", "partial": partial}
+    result = lm.solve(made({**PROBLEMS["endpoint"], "local_controller": hold}))
+    assert result.claims["safe"] is True
+    path = exported(result, tmp_path)
+    said = json.loads(path.read_text().splitlines()[0])["map"]
+    assert said["attractor"] == np.flatnonzero(result.cell_status == 0).tolist()
+    assert said["ends_on_path"] is False
+    assert "claim 7 safe: holds" in checked(path)[1]
+
+
 def test_nothing_is_said_of_sampled_successors(tmp_path):
     path = exported(lm.solve(made(steps())), tmp_path)
     assert "map" not in json.loads(path.read_text().splitlines()[0])
