@@ -19,7 +19,14 @@ from lmdsl.cli.streams import say, tell
 from lmdsl.errors import LmdslError, plain_text, printable
 from lmdsl.results.status import Status
 
-OPTIONS = ("tolerance", "time_limit", "max_iterations", "require_all", "restrict_to_gamma")
+OPTIONS = (
+    "tolerance",
+    "time_limit",
+    "max_iterations",
+    "require_all",
+    "restrict_to_gamma",
+    "proved",
+)
 # Runs of the true map that follow a solve: how many, how long, and how long all together.
 STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
 
@@ -35,6 +42,8 @@ def add(command: Command) -> None:
                        help="refuse a problem with a cell that cannot be stabilized")  # fmt: skip
     solve.add_argument("--restrict-to-gamma", action="store_true",
                        help="solve on the cells for which gamma is feasible")  # fmt: skip
+    solve.add_argument("--proved", type=float, metavar="T",
+                       help="repair until this share of C is proved to arrive")  # fmt: skip
     solve.add_argument("--out", metavar="DIR", help="write controller and certificate to DIR")
     solve.add_argument("--no-simulate", dest="simulate", action="store_false",
                        help="make no runs of the true map")  # fmt: skip

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common import inputs
 from lmdsl.common.types import Bools, Indices, Policy
+from lmdsl.errors import BadInput
 from lmdsl.machine import memory, threads
 from lmdsl.machine.kernels import ONE, fixed, kernel
 from lmdsl.model.rows import Rows
@@ -35,6 +37,15 @@ class Predecessors:
         pair = np.empty(len(rows.target), dtype=np.int32 if small else np.int64)
         _transpose(rows.pointer, rows.target, pointer, pair)
         return cls(pointer, pair)
+
+
+def own_columns(policy: Any, pair_pointer: Indices) -> Policy:
+    """Return a policy; BadInput unless it names one column of each cell's own."""
+    found = inputs.indices(policy, int(pair_pointer[-1]), "policy", "columns")
+    first, last = pair_pointer[:-1], pair_pointer[1:]
+    if len(found) != len(first) or not ((found >= first) & (found < last)).all():
+        raise BadInput("a policy names one column of each cell's own", "policy")
+    return found
 
 
 class Graph(NamedTuple):

@@ -32,6 +32,7 @@ from lmdsl.model.local.controller import LocalController
 from lmdsl.model.rows import RowArrays, Rows, digest_of
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.successors.dropping import left_out
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem.problem import Problem
 
@@ -68,8 +69,9 @@ class StabilizationLP(Frozen):
     sure_levels
         See :meth:`Successors.sure_levels`; None where successors are not enclosed.
     hold
-        Control index of the attractor cells that hold, -1 elsewhere, shape (N,), int32; None where
-        the problem does not ask for them.
+        Control index of the attractor cells that hold, else -1, shape (N,); None if not asked for.
+    dropped
+        Pairs (cell, control) that were left out, in order, shape (D, 2); None where there is none.
     """
 
     problem: Problem
@@ -85,6 +87,7 @@ class StabilizationLP(Frozen):
     weight: Floats
     sure_levels: NDArray[np.int32] | None = None
     hold: holding.Controls | None = None
+    dropped: NDArray[np.int64] | None = None
     _known: InitVar[Levels | None] = None
     _levels: ClassVar[Levels | None] = None
 
@@ -182,12 +185,7 @@ class StabilizationLP(Frozen):
 
     def under(self, policy: Indices) -> "StabilizationLP":
         """Return the model under a policy, a column per cell: its only policy is ``arange(n)``."""
-        policy = inputs.indices(policy, self.K, "policy", "columns")
-        if (
-            len(policy) != self.n
-            or not ((policy >= self.pair_pointer[:-1]) & (policy < self.pair_pointer[1:])).all()
-        ):
-            raise BadInput("a policy names one column of each cell's own", "policy")
+        policy = algorithm_1.own_columns(policy, self.pair_pointer)
         return replace(
             self,
             pair_pointer=np.arange(self.n + 1, dtype=np.int64),
@@ -228,7 +226,8 @@ class StabilizationLP(Frozen):
         before = (self.cell_status, "<u1"), (self.pair_pointer, "<i8"), (self.control, "<i4")
         after = (self.cost, "<f8"), (self.weight, "<f8"), (self.controls, "<f8")
         hold = () if self.hold is None else ((self.hold, "<i4"),)
-        return digest_of(self.rows, self.gamma, before, (*after, *hold))
+        left = () if self.dropped is None else ((np.append(-1, self.dropped), "<i8"),)
+        return digest_of(self.rows, self.gamma, before, (*after, *hold, *left))
 
     def expand(self, values: NDArray[Any], attractor: Any, outside: Any) -> NDArray[Any]:
         """Spread values on C over all N cells."""
@@ -256,8 +255,9 @@ class StabilizationLP(Frozen):
 
 @own_arithmetic
 def compile(  # noqa: A001
-    problem: Problem, progress: Progress | None = None, time_limit: float | Deadline | None = None
-) -> StabilizationLP:
+    problem: Problem, progress: Progress | None = None,
+    time_limit: float | Deadline | None = None, *, dropped: Any = None,
+) -> StabilizationLP:  # fmt: skip
     """Compile a problem: transitions, stabilizable set and the LP on it.
 
     Parameters
@@ -268,6 +268,8 @@ def compile(  # noqa: A001
         Called with (stage, fraction done) during long work.
     time_limit
         Seconds. What takes a moment is compiled whatever the limit.
+    dropped
+        Pairs (cell, control) to leave out, shape (D, 2).
 
     Raises
     ------
@@ -290,16 +292,17 @@ def compile(  # noqa: A001
     sets = holding.within(declared, problem, hold)
     transitions = assemble(problem, partition, progress, deadline, sets)
     successors = Successors.asked_for(problem, partition, transitions, deadline, progress)
-    found = stabilizable_set.of_problem(problem, transitions, deadline, successors)
+    controls = control_vectors(problem)
+    pairs, left = left_out(dropped, transitions, len(controls))
+    found = stabilizable_set.of_problem(problem, transitions, deadline, successors, left)
     kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
     cells = sets.free[found.inside]
-    # The search that found C ends with Algorithm 1 on the surviving pairs.
-    policy = found.pair[found.inside]
+    policy = found.pair[found.inside]  # the search for C ends with Algorithm 1 on its pairs
     column = policy if isinstance(kept, slice) else np.searchsorted(kept, policy)
     lp = StabilizationLP(
         problem=problem,
         partition=partition,
-        controls=control_vectors(problem),
+        controls=controls,
         cell_status=stabilizable_set.statuses(transitions, found),
         cells=cells,
         pair_pointer=pair_pointer,
@@ -310,6 +313,7 @@ def compile(  # noqa: A001
         weight=sets.weight(cells),
         sure_levels=None if successors is None else successors.sure_levels(),
         hold=hold,
+        dropped=pairs,
         _known=(found.level[found.inside], column),
     )
     views = (lp.controls, lp.control, lp.cost)

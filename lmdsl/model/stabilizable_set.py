@@ -60,7 +60,8 @@ class Stabilizable:
     # level, pair: algorithm 1 on the surviving pairs, see :func:`tree`; each of shape (F,)
     level: NDArray[np.int32]
     pair: Indices
-    admissible: Bools | None = None  # which pairs enclosures leave, shape (pairs,); None: all
+    # which pairs enclosures leave, of those that were not dropped, shape (pairs,); None: all
+    admissible: Bools | None = None
 
 
 def stabilizable(
@@ -68,17 +69,23 @@ def stabilizable(
     rows: Rows,
     deadline: Deadline | None = None,
     successors: Successors | None = None,
+    left: Bools | None = None,
 ) -> Stabilizable:
     """Return the greatest set from which A is reached almost surely, and the pairs it keeps.
 
-    With ``successors`` a pair is kept only if all that its image can meet lies in C u A.
+    With ``successors`` a pair is kept only if all that its image can meet lies in C u A. Pairs
+    that are not ``left`` are not used; None: all are.
     """
     deadline = Deadline.of(deadline)
     before: Predecessors | None = None
-    admissible = None if successors is None else successors.admissible
+    admissible = left if successors is None else successors.admissible
+    if successors is not None and left is not None:
+        admissible = successors.admissible & left
     alive = np.ones(rows.count, dtype=np.bool_) if admissible is None else admissible.copy()
     inside = np.ones(rows.columns, dtype=np.bool_)
     choices = np.diff(pair_pointer)
+    if left is not None:
+        choices = np.bincount(owner(pair_pointer)[left], minlength=len(choices))
     reaches = None
     while True:
         level, pair = tree(pair_pointer, rows, alive, before)
@@ -125,6 +132,7 @@ def of_problem(
     transitions: Transitions,
     deadline: Deadline | None = None,
     successors: Successors | None = None,
+    left: Bools | None = None,
 ) -> Stabilizable:
     """Return the stabilizable set of a problem's transitions.
 
@@ -133,7 +141,7 @@ def of_problem(
     gamma b >= 1 it does not, and A has to be reached as without a discount.
     """
     rows = transitions.rows if problem.ends_in_time else transitions.rows.without_end()
-    return stabilizable(transitions.pair_pointer, rows, deadline, successors)
+    return stabilizable(transitions.pair_pointer, rows, deadline, successors, left)
 
 
 def of_transitions(

@@ -175,8 +175,7 @@ class _Job:
         attractor = lp.cell_status == CellStatus.ATTRACTOR
         local = check_of(lp, self.finish)
         held = holding.note(lp.problem, lp.partition, lp.hold)
-        data = self._data(witness)
-        error = self._integration_error()
+        data, error = self._data(witness), self._integration_error()
         said = [data.sentence() if data else "", error.warning() if error else ""]
         return Result(
             status=status,
@@ -208,6 +207,7 @@ class _Job:
             witness=_spread(lp, w, 0.0, 0.0, 0.0),
             control_vectors=lp.controls,
             sure_levels=lp.sure_levels,
+            dropped=lp.dropped,
             lp=lp,
             **more,
         )

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from lmdsl.model.lp import StabilizationLP
     from lmdsl.proof.record import Proof
 
-ARRAYS = ("control_index", "value", "lower", "measure", "cell_status")
-
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
 class Result(Summary):
@@ -59,14 +57,17 @@ class Result(Summary):
     measure
         Shape (N,): the Lyapunov measure mu, 0 off C.
     cell_status
-        Shape (N,), uint8: 0 attractor, 1 stabilized, 2 escapes, 3 trapped, 4 leads to these, 5
-        avoid.
+        Shape (N,), uint8: the codes of :class:`lmdsl.model.stabilizable_set.CellStatus`.
     witness
         Shape (N,): ``stability_vector`` and ``refusal_vector``, as they are saved.
     control_vectors
         Shape (M, p).
     sure_levels
         Shape (N,), int32, or None: in how many steps some controller surely enters A, -1: unknown.
+    dropped, declared_lower
+        Pairs (cell, control) dropped by repair, (D, 2), and W of the model with all, (N,); or None.
+    proof
+        Of a problem solved with ``proved``: what becomes of C; None for a loaded result.
     iterations
         Iterations in the backend's own sense.
     log
@@ -92,6 +93,9 @@ class Result(Summary):
     witness: Floats
     control_vectors: Floats
     sure_levels: NDArray[np.int32] | None = None
+    dropped: NDArray[np.int64] | None = None
+    declared_lower: Floats | None = None
+    proof: Proof | None = None
     iterations: int | None = None
     log: str = ""
     gap_before_polish: float | None = None
@@ -200,11 +204,6 @@ class Result(Summary):
         ----------
         boxes
             Axis name to ``(a, b)``; the region is the cells of C inside their union.
-
-        Returns
-        -------
-        CostFrom
-            Proved bounds, and the share m(B) of the weight.
 
         Raises
         ------

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lmdsl import backends
 from lmdsl.backends import Backend, Options, Solution, Stop
@@ -41,6 +42,7 @@ def solve(
     max_iterations: int | None = None,
     require_all: bool = False,
     restrict_to_gamma: bool = False,
+    proved: float | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Solve a problem and verify the answer.
@@ -64,6 +66,10 @@ def solve(
     restrict_to_gamma
         Where gamma is infeasible for some cells, solve on the others: the cells left out get the
         status BEYOND_GAMMA, and ``witness`` proves that no policy has finite cost from them.
+    proved
+        Share of the volume of C that is to be proved to arrive, on the true map: pairs that lose
+        runs, or of which that is undecided, are dropped and the rest is solved again, until it is
+        reached or nothing helps (see ``Result.proved``).
     progress
         Called with (stage, fraction done, or -1).
 
@@ -95,13 +101,30 @@ def solve(
         restrict_to_gamma=restrict_to_gamma,
         progress=progress,
     )
+    if proved is None:
+        return _solved(problem, request)
+    from lmdsl.results.directory import repairing
+
+    declared = problem if isinstance(problem, Problem) else problem.problem
+    repairing.require_provable(proved, declared, restrict_to_gamma)
+    first = _solved(problem, request)
+
+    def again(dropped: NDArray[np.int64]) -> Result:
+        return _solved(first.problem, request, dropped)
+
+    return repairing.repaired(first, again, proved, request.deadline, progress)
+
+
+def _solved(problem: Problem | StabilizationLP, request: "_Request", dropped: Any = None) -> Result:
+    """Compile, without some pairs, and answer."""
     if isinstance(problem, StabilizationLP):
         return _answer(problem, request)
     started = time.perf_counter()
     try:
-        lp = compile(problem, progress, request.deadline)
+        lp = compile(problem, request.progress, request.deadline, dropped=dropped)
     except TimeLimitReached as error:
-        return not_compiled(backend, problem, tolerance, error, time.perf_counter() - started)
+        seconds = time.perf_counter() - started
+        return not_compiled(request.name, problem, request.tolerance, error, seconds)
     return _answer(lp, request, time.perf_counter() - started)
 
 

@@ -76,6 +76,39 @@ class Coverage(Reported):
         return f"{text} ({percent:.4g} %)"
 
 
+@dataclass(frozen=True)
+class Proved(Reported):
+    """How far a problem was repaired (:func:`lmdsl.solve` with ``proved``).
+
+    Attributes
+    ----------
+    target
+        The share of the volume of the first C that was to be proved to arrive.
+    arrives
+        The share that is; None where its proof was not kept.
+    dropped
+        Number of pairs (cell, control) that were dropped.
+    cells
+        Number of cells of the first C.
+    lower_bound
+        The lower bound of the declared model, with no pair dropped.
+    sha256
+        Of the list of dropped pairs; empty where there is none.
+    """
+
+    target: float
+    arrives: float | None
+    dropped: int
+    cells: int
+    lower_bound: float | None
+    sha256: str = ""
+
+    @property
+    def reached(self) -> bool:
+        """Whether the target is reached."""
+        return self.arrives is not None and self.arrives >= self.target
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Summary(Frozen):
     """The scalar part of a result: the keys of ``lmdsl solve --json``, in order.
@@ -113,6 +146,8 @@ class Summary(Frozen):
     integration_error
         How far the compiled steps are from the differential equation; None for a map, for a loaded
         result, and where there was no time.
+    proved
+        How far the problem was repaired; None where that was not asked for.
     """
 
     status: Status
@@ -137,10 +172,11 @@ class Summary(Frozen):
     simulation: Simulation | None = None
     data: DataReport | None = None
     integration_error: IntegrationError | None = None
+    proved: Proved | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: infinity is ``"inf"``, unknown is None, never NaN."""
-        later = ("simulation", "data", "integration_error")
+        later = ("simulation", "data", "integration_error", "proved")
         names = [f.name for f in fields(Summary) if f.name not in later]
         return {
             **{name: jsonable(getattr(self, name)) for name in names},
@@ -151,6 +187,7 @@ class Summary(Frozen):
             "integration_error": jsonable(self.integration_error),
             "sure_cells": self.sure_cells,
             "claims": self.claims,
+            "proved": jsonable(self.proved),
         }
 
     @property
@@ -177,5 +214,7 @@ class Summary(Frozen):
 
     @property
     def exit_status(self) -> int:
-        """Exit status of the command line."""
-        return Status(self.status).exit_status
+        """Exit status of the command line: of the status, or 1 where a proof misses its target."""
+        found = Status(self.status).exit_status
+        missed = self.proved is not None and not self.proved.reached
+        return 1 if missed and not found else found

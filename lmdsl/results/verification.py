@@ -5,7 +5,6 @@ vectors are checked against it by the same inequalities that certified them.
 """
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -30,7 +29,7 @@ from lmdsl.model.rows import Rows
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
-from lmdsl.results.directory import archive
+from lmdsl.results.directory import archive, repaired
 from lmdsl.results.directory.audit import (
     NOT_EVALUATED,
     differences,
@@ -39,11 +38,10 @@ from lmdsl.results.directory.audit import (
 )
 from lmdsl.results.directory.proved import proof_findings
 from lmdsl.results.directory.recorded import policy_of
+from lmdsl.results.directory.repaired import Judge
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.systems import MatrixSystem
-
-Judge = Callable[[StabilizationLP, Witness, float], Certificate]
 
 
 @dataclass(frozen=True)
@@ -111,12 +109,9 @@ class Verification:
 
 @own_arithmetic
 def verify(
-    path: str | os.PathLike[str],
-    *,
-    exact: bool = False,
-    progress: Progress | None = None,
+    path: str | os.PathLike[str], *, exact: bool = False, progress: Progress | None = None,
     time_limit: float | Deadline | None = None,
-) -> Verification:
+) -> Verification:  # fmt: skip
     """Recompile the problem of a result directory and check every claim it makes.
 
     Parameters
@@ -150,16 +145,9 @@ def verify(
     ]
     lp = whole = recompiled(path, result, progress, deadline)
     in_time()
-    functions = result.problem.functions
-    if functions:
+    if result.problem.functions:
         reasons += function_differences(lp, result)
-        notes.insert(0, NOT_EVALUATED[functions])
-        if "system" in functions and result.local_controller is not None:
-            notes.append("what the local controller does was not checked")
-        if "system" in functions and result.problem.terminal_cost is not None:
-            notes.append("the terminal cost was not checked: it is paid at images of the function")
-        if (result.cell_status == CellStatus.BEYOND_GAMMA).any():
-            notes.append("that gamma is infeasible from the cells left out was not checked")
+        notes = _function_notes(result) + notes
     lp = _restricted(lp, result, reasons, judge)
     same = result.model_sha256 in (lp.digest, archive.identity(lp))
     if not same:
@@ -176,11 +164,26 @@ def verify(
     in_time()
     reasons += local_differences(lp, result, stored.certificate, deadline)
     reasons += proof_findings(path, result, stored.certificate.proof, in_time, notes)
+    declared = partial(compile, result.problem, progress, deadline)
+    reasons += repaired.differences(result, stored.certificate.proof, declared, lp, judge)
     found = Verification(
         not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
     )
     system = result.problem.system
     return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
+
+
+def _function_notes(result: Result) -> list[str]:
+    """Return what was not checked where the problem has Python functions."""
+    functions = result.problem.functions
+    notes = [NOT_EVALUATED[functions]]
+    if "system" in functions and result.local_controller is not None:
+        notes.append("what the local controller does was not checked")
+    if "system" in functions and result.problem.terminal_cost is not None:
+        notes.append("the terminal cost was not checked: it is paid at images of the function")
+    if (result.cell_status == CellStatus.BEYOND_GAMMA).any():
+        notes.append("that gamma is infeasible from the cells left out was not checked")
+    return notes
 
 
 def _restricted(
@@ -197,17 +200,15 @@ def _restricted(
 
 
 def recompiled(
-    path: str | os.PathLike[str],
-    result: Result,
-    progress: Progress | None = None,
+    path: str | os.PathLike[str], result: Result, progress: Progress | None = None,
     time_limit: float | Deadline | None = None,
-) -> StabilizationLP:
+) -> StabilizationLP:  # fmt: skip
     """Return the finite model of a directory made anew; of Python functions, what they gave."""
     problem = result.problem
     if "system" in problem.functions:
         return _stored_model(path, result)
     if not problem.functions:
-        return compile(problem, progress, time_limit)
+        return compile(problem, progress, time_limit, dropped=result.dropped)
     lp = compile(problem.replaced(stage_cost="0"), progress, time_limit)
     cost = archive.read_model(path, result, {"cost": ((lp.K,), "<f8")})["cost"]
     if not (np.isfinite(cost) & (cost >= 0)).all():

@@ -19,7 +19,7 @@ KEYS = [
     "contraction", "gamma_bar", "cells", "controls", "pairs", "attractor_cells",
     "stabilizable_cells", "polish_steps", "seconds", "message",
     "local_controller", "beyond_gamma", "coverage", "simulation", "data",
-    "integration_error", "sure_cells", "claims",
+    "integration_error", "sure_cells", "claims", "proved",
 ]  # fmt: skip
 
 

@@ -29,7 +29,7 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem, parse_problem
-from lmdsl.results.directory import reading, writing
+from lmdsl.results.directory import proved, reading, repaired, writing
 from lmdsl.results.directory.certificate_file import CertificateFile, scope
 from lmdsl.results.directory.reading import FORMAT, Reading
 from lmdsl.results.result import Result
@@ -108,7 +108,9 @@ def _contents(result: Result) -> dict[str, bytes]:
     contents["solution.npz"] = arrays.packed(
         {name: getattr(result, name) for name in _types(problem)}
     )
-    return contents
+    if result.proof is not None:
+        contents[proved.NAME] = arrays.packed(result.proof.arrays())
+    return contents | repaired.contents(result)
 
 
 def _certificate(result: Result) -> dict[str, Any]:
@@ -122,7 +124,8 @@ def _certificate(result: Result) -> dict[str, Any]:
         "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
         "versions": versions(),
         "scope": scope(result.problem),
-        "proof": None,  # of another save
+        "proof": proved.said_of(result.proof),  # that of a loaded result is one of another save
+        "proved": repaired.now(result, result.proof),
     }
     return {
         key: jsonable(apart[key] if key in apart else getattr(result, key))
@@ -235,6 +238,7 @@ def _read(files: Reading) -> Stored:
     vectors = _arrays(
         files, "solution.npz", {name: ((N,), kind) for name, kind in _types(problem).items()}
     )
+    vectors |= repaired.read(files, stored.proved, N, M)
     result = _result(problem, partition, stored, vectors)
     return Stored(result, stored, tuple(files.rewritten))
 
@@ -249,6 +253,7 @@ def _result(
     if loaded["cell_status"].max(initial=0) > max(CellStatus):
         raise BadInput("cell_status holds an unknown code", "solution.npz")
     said = dict(stored) | loaded
+    del said["proof"]  # its keys; the boxes stay in their file
     known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said}
     proof: dict[str, Any] = {f.name: getattr(stored, f.name, None) for f in fields(Certificate)}
     proof |= {claim.name: bool(stored.claims.get(claim.name)) for claim in CLAIMS}

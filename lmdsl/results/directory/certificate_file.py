@@ -17,7 +17,7 @@ from lmdsl.errors import BadInput
 from lmdsl.problem.problem import Problem
 from lmdsl.results.directory.reading import COMMIT
 from lmdsl.results.status import Cause, Status
-from lmdsl.results.summary import Seconds
+from lmdsl.results.summary import Proved, Seconds
 from lmdsl.systems import System
 
 
@@ -110,6 +110,7 @@ class CertificateFile(_Keys):
     versions: dict[str, str] = Field(default_factory=dict)
     scope: str = System.scope
     proof: ProofKeys | None = None
+    proved: Annotated[Proved | None, _record(Proved)] = None
 
     @classmethod
     def read(cls, data: dict[str, Any]) -> Self:

@@ -17,7 +17,7 @@ from lmdsl.proof import checking
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.proving import prove as proved
 from lmdsl.proof.record import BOX, Proof, expected
-from lmdsl.results.directory import reading, writing
+from lmdsl.results.directory import reading, repaired, writing
 from lmdsl.results.directory.certificate_file import ProofKeys
 from lmdsl.results.directory.reading import Reading
 from lmdsl.results.result import Result
@@ -82,8 +82,9 @@ def add(path: str | os.PathLike[str], result: Result, proof: Proof) -> None:
 
     certificate, files = reading.read(folder, content)
     files[NAME] = arrays.packed(proof.arrays())
-    said = {name: jsonable(getattr(proof, name)) for name in ProofKeys.model_fields}
-    about = {**certificate, "proof": said}
+    about = {**certificate, "proof": said_of(proof)}
+    if result.proved is not None:
+        about["proved"] = jsonable(repaired.now(result, proof))
 
     def commit(keys: dict[str, Any]) -> bytes:
         return reading.text({**about, **keys})
@@ -92,6 +93,13 @@ def add(path: str | os.PathLike[str], result: Result, proof: Proof) -> None:
         writing.write(folder, files, commit)
     except OSError as error:
         raise BadInput(f"the proof cannot be written: {error.strerror}", "out") from None
+
+
+def said_of(proof: Proof | None) -> Any:
+    """Return what a certificate says of a proof."""
+    if proof is None:
+        return None
+    return {name: jsonable(getattr(proof, name)) for name in ProofKeys.model_fields}
 
 
 def _policy(files: Reading, result: Result) -> dict[str, NDArray[Any]]:

@@ -23,7 +23,7 @@ from lmdsl.errors import BadInput, shown
 FORMAT = "lmdsl-result/1"
 COMMIT = "certificate.json"
 # The files of a save; of the others in a directory none is read, replaced or removed.
-NAMES = ("problem.json", "solution.npz", "model.npz", "proof.npz", COMMIT)
+NAMES = ("problem.json", "solution.npz", "model.npz", "proof.npz", "dropped.npz", COMMIT)
 SAVE = "[0-9a-f]{16}"
 TRIES = 100  # number of attempts to read one save while others replace it
 T = TypeVar("T")
