@@ -316,6 +316,5 @@ def compile(  # noqa: A001
         dropped=pairs,
         _known=(found.level[found.inside], column),
     )
-    views = (lp.controls, lp.control, lp.cost)
-    freeze(*(view.base for view in views if isinstance(view.base, np.ndarray)))
+    freeze(*(x.base for x in (lp.controls, lp.control, lp.cost) if isinstance(x.base, np.ndarray)))
     return lp
