@@ -13,7 +13,7 @@ from lmdsl.model.grid.boxes import Ends
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus, sets_of
 from lmdsl.model.successors import counting
-from lmdsl.model.successors.ranges import PathTables, taken
+from lmdsl.model.successors.ranges import PathTables, pairwise, taken
 from lmdsl.model.successors.slabs import Slab, Slabs, Span
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem.problem import Problem
@@ -97,10 +97,11 @@ class WholeCells:
         doubt = None
         if admitted is not None and not admitted.all():
             doubt = Doubt("not admissible everywhere")
-        every, state = list(self._slabs.stretches(block)), np.zeros((1, parts), dtype=np.uint8)
-        for number, spans in enumerate(every):
+        state = np.zeros((1, parts), dtype=np.uint8)
+        for spans, judged in self._slabs.stretches(block):
             first, last, out = taken(spans, at, p, parts)
-            counting.judge(self._judged, first, last, out, number < len(every) - 1, state)
+            way = pairwise(judged, at, parts)
+            counting.judge(self._judged, first, last, out, way, state)
             lost = state[0] == counting.LOST
             if doubt is None and lost.any():
                 doubt = self._doubt(spans, first[0], last[0], out[0], lost)

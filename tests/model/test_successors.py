@@ -398,3 +398,32 @@ def test_within_bounds_normal_noise():
         x = partition.centres(cell[[pair]])
         _, reached = partition.enter(0.5 * x + 0.1 * noise)
         assert inside(partition, found, pair, reached).all()
+
+
+def test_only_where_it_is_judged_a_path_is_absorbed():
+    """Slow cells beside fast ones: their arcs are judged at the end only, past the attractor.
+
+    From x near 0 a step turns round a corner of the attractor: it is in there on the way, but its
+    two judged places are outside. So it is not absorbed, and ends in avoid.
+    """
+    problem = declared(
+        {"kind": "ode", "derivative": {"x": "where(x > 2, 6, 0.4)", "y": "0"}, "step": 1.0},
+        {"x": line(0, 16, 160), "y": line(0, 1, 1)}, {},
+        {"boxes": [{"x": [0.2, 0.3]}, {"x": [4, 16]}]},
+        avoid={"boxes": [{"x": [0.4, 0.5]}]},
+    )  # fmt: skip
+    partition, _, found, cell = successors(problem)
+    result = lm.solve(problem)
+    status = result.cell_status
+    rng = np.random.default_rng(0)
+    for pair in np.flatnonzero(found.admissible):
+        x = states_of(partition, cell[pair], 40, rng)
+        h = np.where(x[:, 0] > 2, 6, 0.4)
+        places = np.maximum(np.ceil(2 * h / 0.1), 1)  # equally spaced, the end among them
+        for start, way, count in zip(x[:, 0], h, places, strict=True):
+            at = start + way * np.arange(1, count + 1) / count
+            where = partition.locate([at, np.full(len(at), 0.5)])
+            events = status[np.where(where >= 0, where, 0)]
+            events = np.where(where < 0, 5, events)
+            decisive = events[np.isin(events, (0, 5))]
+            assert not len(decisive) or decisive[0] == 0

@@ -99,7 +99,7 @@ def judge(judged, first, last, out, way, state):  # type: ignore[no-untyped-def]
             if state[k, part] == GOING:
                 if out[k, part] or count(avoid, first, last, k, part) > 0:
                     state[k, part] = LOST
-                elif way:
+                elif way[k, part]:
                     cells = np.int64(1)
                     for a in range(first.shape[2]):
                         cells *= np.int64(last[k, part, a]) - np.int64(first[k, part, a]) + 1

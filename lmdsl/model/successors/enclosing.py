@@ -46,11 +46,14 @@ class Stretch(NamedTuple):
         where the place may be undefined or infinite.
     rises, falls
         By axis, where the path begins: whether it certainly never goes below, or above, its start.
+    judged
+        Of the path: whether a place at which it is judged certainly lies in it; None at the end.
     """
 
     places: tuple[Interval, ...]
     rises: tuple[Bools, ...] = ()
     falls: tuple[Bools, ...] = ()
+    judged: Bools | None = None
 
 
 class Encloser:
@@ -99,15 +102,29 @@ class Encloser:
                     [enclosure(x, at, away) for x, at in zip(xs, ats, strict=True)]
                     for xs, ats in zip(boxed, middle, strict=True)
                 )
-                for points in _blossoms(self.arc_parts):
+                fast = self._judged_often(parts)
+                for i, points in enumerate(_blossoms(self.arc_parts)):
+                    judged = fast | (i == self.arc_parts - 1)  # the end of an arc always is
                     ways = [_ways(points, each) for each in zip(*parts, strict=True)]
                     places = tuple(
                         iv.add(at, iv.hull(way[0], way[1]))
                         for at, way in zip(start, ways, strict=True)
                     )
                     rises, falls = (w[1].low >= 0 for w in ways), (w[1].high <= 0 for w in ways)
-                    yield Stretch(places) if begun else Stretch(places, tuple(rises), tuple(falls))
+                    turns = () if begun else (tuple(rises), tuple(falls))
+                    yield Stretch(places, *(turns or ((), ())), judged)
                     begun = True
+
+    def _judged_often(self, parts: Sequence[Sequence[Interval]]) -> Bools:
+        """Return whether every part of an arc certainly holds a place at which it is judged.
+
+        These are equally spaced, at least as many as twice the cells of the steepest end.
+        """
+        steep = np.zeros(())
+        for slopes in parts[:2]:
+            for slope, width in zip(slopes, self.width, strict=True):
+                steep = np.maximum(steep, iv.mignitude(slope) / width)
+        return np.asarray(2 * steep > self.arc_parts - 1 + 1e-6)
 
     def speed(self, boxes: StepBoxes, guard: Guard | None = None) -> Floats:
         """Return how far the substeps lead at most, in cells of an axis."""

@@ -136,7 +136,7 @@ class Inclusion:
         every = StepBoxes(states, controls, noise)
         lost = np.zeros((count, parts), dtype=np.uint8)
         for stretch in self.encloser.path(every, guard) if self.path else ():
-            self._met(stretch, boxes.place, lost, way=True)
+            self._met(stretch, boxes.place, lost)
         first, last = self._met(self.encloser.images(every, guard), boxes.place, lost)
         kept: Bools = np.all(lost != counting.LOST, axis=1)
         counting.keep(self.others, first, last, kept)
@@ -148,7 +148,7 @@ class Inclusion:
         return kept
 
     def _met(
-        self, stretch: Stretch, place: Indices, lost: NDArray[np.uint8], way: bool = False
+        self, stretch: Stretch, place: Indices, lost: NDArray[np.uint8]
     ) -> tuple[NDArray[Any], NDArray[Any]]:
         """Judge a stretch; return the ranges that it meets, shape (B, parts, d) each."""
         axes = range(self.partition.dimension)
@@ -156,5 +156,7 @@ class Inclusion:
         spans = [met(stretch, k, self.partition, own[k]) for k in axes]
         at = [np.arange(len(place))]
         first, last, out = taken(spans, at, self.partition, self.encloser.parts)
+        judged = np.asarray(False if stretch.judged is None else stretch.judged)
+        way = np.ascontiguousarray(np.broadcast_to(judged, out.shape))
         counting.judge(self.judged, first, last, out, way, lost)
         return first, last

@@ -105,9 +105,9 @@ def enclosed(
             some = slice(begin, min(begin + PAIRS, end))
             at = _place(partition, block, cell[some], control[some])
             lost = np.zeros((len(at[0]), parts), dtype=np.uint8)
-            for number, spans in enumerate(every):
+            for spans, seen in every:
                 first, last, out = taken(spans, at, partition, parts)
-                way = number < len(every) - 1
+                way = pairwise(seen, at, parts)
                 counting.judge(judged, first, last, out, way, lost)
             found.first[some], found.last[some] = first, last
             found.out[some] = (lost == counting.LOST).any(axis=1)
@@ -118,6 +118,14 @@ def enclosed(
         if progress:
             progress("enclose", end / max(count, 1))
     return found
+
+
+def pairwise(holds: Bools | None, at: list[Indices], parts: int) -> Bools:
+    """Return what holds of pairs, shape (pairs, parts)."""
+    if holds is None:
+        return np.zeros((len(at[0]), parts), dtype=np.bool_)
+    found = holds.reshape(-1, holds.shape[-1])[_offset(holds.shape[:-1], at)]
+    return np.ascontiguousarray(np.broadcast_to(found, (len(at[0]), parts)))
 
 
 def taken(

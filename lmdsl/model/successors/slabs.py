@@ -8,7 +8,7 @@ of the pieces are joined: their hull, on a circle turned next to each other.
 import math
 from collections.abc import Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -106,16 +106,19 @@ class Slabs:
         axes = self.partition.dimension + 2
         return array.reshape([-1 if k == axis else 1 for k in range(axes)])
 
-    def stretches(self, block: Slab) -> Iterator[list[Span]]:
+    def stretches(self, block: Slab) -> Iterator[tuple[list[Span], Bools | None]]:
         """Yield by axis where the stretches of the path lie, in order, and last the images.
+
+        With the stretches comes whether they are judged, see :class:`Stretch`.
 
         Each array has the axes of the block, 1 long where it does not depend on one.
         """
         boxes = self._boxes(block)
         if self.path:
             for stretch in self.encloser.path(boxes, self.guard):
-                yield self._spans(block, stretch)
-        yield self._spans(block, self.encloser.images(boxes, self.guard))
+                assert stretch.judged is not None
+                yield self._spans(block, stretch), self._everywhere(block, stretch.judged)
+        yield self._spans(block, self.encloser.images(boxes, self.guard)), None
 
     def admits(self, block: Slab) -> Bools | None:
         """Return on which cells the condition of admissible pairs certainly holds; None: all."""
@@ -124,12 +127,15 @@ class Slabs:
         boxes = self._boxes(block)
         values = dict(zip(self.names, (*boxes.states, *map(Interval.point, boxes.controls)),
                           strict=True))  # fmt: skip
-        surely = np.asarray(self.admitted.decide(values, self.guard)[0][0], dtype=np.float64)
-        axes = self.partition.dimension + 2
+        return self._everywhere(block, self.admitted.decide(values, self.guard)[0][0])
+
+    def _everywhere(self, block: Slab, holds: Any) -> Bools:
+        """Return on which cells something holds, from the pieces on which it does."""
+        surely, axes = np.asarray(holds, dtype=np.float64), self.partition.dimension + 2
         surely = surely.reshape((1,) * (axes - surely.ndim) + surely.shape)
         for k in range(self.partition.dimension):
             surely, _ = self._joined((surely, -surely), k, block, None)
-        return surely > 0
+        return np.asarray(surely > 0)
 
     def _boxes(self, block: Slab) -> StepBoxes:
         d = self.partition.dimension
@@ -220,7 +226,7 @@ def blocks(grid: Slabs) -> Iterator[tuple[Slab, int]]:
     shape, M = grid.partition.shape, grid.controls.shape[1]
     limit = max(LANES, min(MOST_LANES, grid.partition.size * M // SHARED))
     small = Slab(tuple((0, min(2, n)) for n in shape), (0, min(2, M)))
-    depends = [[n > 1 for n in low.shape] for spans in grid.stretches(small) for low, _ in spans]
+    depends = [[n > 1 for n in low.shape] for spans, _ in grid.stretches(small) for low, _ in spans]
 
     def fits(spans: list[int], controls: int) -> bool:
         lengths = [n * q for n, q in zip(spans, grid.pieces, strict=True)]
