@@ -63,7 +63,7 @@ class Partition(Frozen):
         if size > MAX_CELLS:
             fault = f"{size:.3g} cells do not fit in memory (limit {MAX_CELLS:.3g})"
             raise BadInput(f"{fault}; use fewer cells", "state_box")
-        low, high = np.array([(axis.low, axis.high) for axis in axes]).T.copy()
+        low, high = np.array([axis.low for axis in axes]), np.array([axis.high for axis in axes])
         cells = np.array([axis.cells for axis in axes], dtype=np.int64)
         return cls(
             names=problem.states,
