@@ -23,11 +23,12 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model import stabilizable_set
 from lmdsl.model.assembly.sampler import Sampler
 from lmdsl.model.assembly.substeps import settled
-from lmdsl.model.assembly.transitions import Transitions, assemble
+from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.discretization import control_count
 from lmdsl.model.grid import boxes
 from lmdsl.model.grid.boxes import Area, Region
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.problem.problem import Problem
@@ -92,7 +93,7 @@ class Explanation(Frozen):
     @cached_property
     def transitions(self) -> Transitions:
         """The transitions of all admissible pairs."""
-        return self.assembled or assemble(self.problem, self.partition)
+        return self.assembled or holding.assembled(self.problem, self.partition)
 
     @cached_property
     def sampler(self) -> Sampler:
@@ -265,10 +266,10 @@ def explain(
     else:
         problem = settled(problem, deadline)
         partition = Partition.of(problem)
-        assembled = assemble(problem, partition, progress, deadline)
+        assembled = holding.assembled(problem, partition, progress, deadline)
         status = _status(problem, partition, assembled, deadline)
     if phase_one and assembled is None:
-        assembled = assemble(problem, partition, progress, deadline)
+        assembled = holding.assembled(problem, partition, progress, deadline)
     if progress:
         progress("explain", -1.0)
     found = []
@@ -304,7 +305,7 @@ def phase_one(problem: Problem, time_limit: float | Deadline | None = None) -> P
     whole_cell.refuse(problem)
     problem = settled(problem, deadline)
     partition = Partition.of(problem)
-    assembled = assemble(problem, partition, deadline=deadline)
+    assembled = holding.assembled(problem, partition, deadline=deadline)
     status = _status(problem, partition, assembled, deadline)
     return PhaseOne.of(partition, assembled, status, problem.gamma, deadline)
 

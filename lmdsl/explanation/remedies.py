@@ -18,10 +18,10 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model import stabilizable_set
 from lmdsl.model.assembly import estimates
 from lmdsl.model.assembly.substeps import settled
-from lmdsl.model.assembly.transitions import assemble
 from lmdsl.model.grid import boxes
 from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local import holding
 from lmdsl.model.sets import CellSets
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.base import OdeSystem
@@ -57,7 +57,7 @@ def coverage(problem: Problem, deadline: Deadline | None = None) -> Stabilizable
     deadline = None if deadline is None else Deadline(deadline.left)
     problem = settled(problem, deadline)
     partition = Partition.of(problem)
-    transitions = assemble(problem, partition, deadline=deadline)
+    transitions = holding.assembled(problem, partition, deadline=deadline)
     found = stabilizable_set.of_transitions(problem, partition, transitions, deadline)
     return StabilizableShare(int(found.inside.sum()), len(found.inside))
 

@@ -147,3 +147,24 @@ def test_a_line_runs_around_the_cells_that_surely_arrive(axes):
     legend = lm.plotting.cost(sampled).get_legend()
     assert "surely arrives" not in [text.get_text() for text in legend.get_texts()]
     assert np.isin(result.sure_levels, (-1, 0, 1, 2, 3)).all()
+
+
+def test_what_holds_is_explained_as_it_is_compiled():
+    """The attractor is what holds of it: by enclosures fewer cells than by samples."""
+    declared = {
+        "format": "lmdsl/1",
+        "system": {"kind": "map", "next": {"x": "1.2*x + u"}},
+        "state_box": {"x": {"low": -1, "high": 1, "cells": 14}},
+        "attractor": {"boxes": [{"x": [-0.4, 0.4]}]},
+        "control_grid": {"u": {"low": -0.3, "high": 0.3, "points": 2}},
+        "stage_cost": "1",
+        "sampling": {"kind": "grid", "per_axis": 1},
+        "local_controller": {"kind": "hold"},
+    }
+    kept = []
+    for more in ({}, {"successors": "enclosed"}):
+        problem = parse_problem({**declared, **more})
+        lp = lm.compile(problem)
+        kept.append(int((lp.cell_status == 0).sum()))
+        assert np.array_equal(lm.explain(problem).cell_status, lp.cell_status)
+    assert kept == [4, 0]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.records import Frozen
-from lmdsl.common.types import Bools, Floats, Indices, Statuses
+from lmdsl.common.types import Bools, Floats, Indices, Progress, Statuses
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.algorithm_1 import owner
@@ -106,6 +106,20 @@ def within(sets: CellSets, problem: Problem, index: Controls | None) -> CellSets
     if index is None or not isinstance(local, HoldControl) or local.partial:
         return sets
     return CellSets.made(index >= 0, sets.avoid, sets.mass)
+
+
+def assembled(
+    problem: Problem,
+    partition: Partition,
+    progress: Progress | None = None,
+    deadline: Deadline | None = None,
+) -> Transitions:
+    """Return the transitions as they are compiled: of the attractor, the cells that hold."""
+    sets = None
+    if isinstance(problem.local_controller, HoldControl):
+        declared = CellSets.of(problem, partition, deadline)
+        sets = within(declared, problem, held(problem, partition, declared, deadline))
+    return assemble(problem, partition, progress, deadline, sets)
 
 
 def stored(problem: Problem, status: Statuses, index: Controls) -> Controls | None:
