@@ -2,6 +2,8 @@
 
 from typing import Any
 
+LONGEST = 300  # characters of a path that are shown
+
 
 class LmdslError(Exception):
     """Base of every error that lmdsl raises on purpose."""
@@ -33,7 +35,8 @@ class BadInput(LmdslError, ValueError):
     def __init__(self, message: str, where: str = "") -> None:
         self.where = where
         self.message = message
-        super().__init__(f"{where}: {message}" if where else message)
+        # A path holds keys of a file, as they are written there.
+        super().__init__(f"{printable(where[:LONGEST])}: {message}" if where else message)
 
 
 class MissingDependency(BadInput):

@@ -12,9 +12,9 @@ from models import mdp, random_lp
 from problems import made, standard_map
 
 import lmdsl as lm
-from lmdsl.certificate import judge
+from lmdsl.certificate import judge, vectors
 from lmdsl.machine import threads
-from lmdsl.model import rows, vectors
+from lmdsl.model import rows
 from lmdsl.optimize import witness
 from lmdsl.optimize.linear import equations, gauss_seidel, substitution
 from lmdsl.optimize.policies import bellman

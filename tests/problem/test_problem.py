@@ -161,3 +161,12 @@ def test_named_systems_name_what_they_need():
 def test_kind_comes_first_in_a_saved_file():
     saved = made(standard_map()).to_dict()
     assert all(next(iter(saved[key])) == "kind" for key in ("system", "sampling"))
+
+
+def test_keys_in_paths_are_printable():
+    """A key of a file may hold anything; a message is one line that a terminal shows as it is."""
+    data = standard_map(4)
+    data["system"] = {"kind": "map", "next": {"\x1b[2J": "open(x)", "x": "q", "y": "y"}}
+    with pytest.raises(lm.BadInput) as caught:
+        made(data)
+    assert str(caught.value).isprintable()

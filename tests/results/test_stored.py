@@ -144,6 +144,8 @@ def test_every_field_of_the_certificate(saved):
                 "sure_cells",
                 "data",
                 "reward",
+                "proof",
+                "proved",
             )
             assert refused(saved) or key in earlier, key
     (saved / "certificate.json").write_bytes(reading.text(good))
