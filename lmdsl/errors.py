@@ -36,7 +36,7 @@ class BadInput(LmdslError, ValueError):
         self.where = where
         self.message = message
         # A path holds keys of a file, as they are written there.
-        super().__init__(f"{printable(where[:LONGEST])}: {message}" if where else message)
+        super().__init__(f"{printable(f'{where}'[:LONGEST])}: {message}" if where else message)
 
 
 class MissingDependency(BadInput):

@@ -231,7 +231,7 @@ def test_only_the_end_of_a_step_enters_the_attractor():
     assert np.flatnonzero(lp.hold >= 0).tolist() == [9]
     partial = lm.compile(parse_problem({**problem, "local_controller": PARTIAL}))
     at = partial.column(2, 0)
-    assert partial.rows.matrix()[at].sum() == 1  # not in A at the end: passes over cell 4
+    assert partial.rows.matrix()[[at]].sum() == 1  # not in A at the end: passes over cell 4
 
 
 # directories ----------------------------------------------------------------------------------
