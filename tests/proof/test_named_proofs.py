@@ -16,6 +16,8 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.proof.checking import faults
 from lmdsl.results.directory.proved import loop_of
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 # What is reached in a few seconds; the whole of it takes minutes for some.
 TARGETS = {"standard_map": 0.4, "logistic_map": 1.0, "henon_map": 0.95, "double_integrator": 0.999,
            "inverted_pendulum": 0.8, "pendulum_on_cart": 0.98, "van_der_pol": 0.999,

@@ -18,6 +18,8 @@ from lmdsl.proof.record import Proof
 from lmdsl.proof.tightening import tighten
 from lmdsl.results.directory.proved import loop_of
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 MAPS = [
     "{a}*x + {b}*y + u", "x + {a}*sin(3*y) + u", "{a}*x*y + u", "x/(1.2 + y) + u",
     "where(x > {b}, x - 0.3, x*{a} + u)", "abs(x - {b}) + u*y", "x - u*max(x, y)",

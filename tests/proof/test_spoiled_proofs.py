@@ -15,6 +15,8 @@ from lmdsl.cli import main
 from lmdsl.proof.checking import faults
 from lmdsl.results.directory.proved import loop_of
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 FORMULA = "where(x > 0.95, 2, where(abs(x - 0.9) < 0.02, 0.5*x + 0.45, 0.9*x - 0.2))"
 
 

@@ -17,6 +17,8 @@ import lmdsl as lm
 from lmdsl.model.sets import CellSets
 from lmdsl.model.true_map import TrueMap
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 
 @functools.cache
 def exported_lines(name):

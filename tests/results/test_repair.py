@@ -14,6 +14,8 @@ from lmdsl.cli import main
 from lmdsl.results.directory import reading
 from lmdsl.results.directory.repairing import _Repair
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 
 def line(formula, **more):
     """x+ = formula on [0, 1], 4 cells, A = the first; u = 0 is cheaper than u = 1."""
