@@ -16,7 +16,7 @@ import lmdsl as lm
 from lmdsl.formulas.program import Program
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.partition import Partition
-from lmdsl.proof.images import enclosing, tapes
+from lmdsl.model.successors.compiled import enclosing, tapes
 
 COUNT, REPEATS = 2**17, 5
 _CALLS = {"negative": "-({0})", "**": "({0})**{1}", "abs": "abs({0})"}

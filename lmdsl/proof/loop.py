@@ -7,8 +7,8 @@ import numpy as np
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.successors.compiled import enclosing
 from lmdsl.problem.problem import Problem
-from lmdsl.proof.images import enclosing
 from lmdsl.proof.images.pieces import pieces
 from lmdsl.proof.images.seen import BoxImages
 

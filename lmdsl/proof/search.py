@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Floats
 from lmdsl.machine.kernels import kernel
-from lmdsl.proof.images.places import BITS, LAST, MAY_ARRIVE, MAY_LEAVE
+from lmdsl.model.successors.compiled.places import BITS, LAST, MAY_ARRIVE, MAY_LEAVE
 
 UNDECIDED, ARRIVES, LOST, STAYS = range(4)  # states of nodes
 MEETS_UNDECIDED, MEETS_ARRIVING, MEETS_LOST, MEETS_STAYING = 1, 2, 4, 8  # 1 << state

@@ -11,8 +11,8 @@ from lmdsl.formulas.enclosures import Jet, enclosure
 from lmdsl.formulas.intervals import Interval, subtract
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.successors.compiled import enclosing, places, tapes
 from lmdsl.model.true_map import TrueMap
-from lmdsl.proof.images import enclosing, places, tapes
 from lmdsl.proof.images.pieces import pieces
 
 BOXES = 300

@@ -9,10 +9,10 @@ from proved_points import exceptions
 
 import lmdsl as lm
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.successors.compiled import enclosing, places
 from lmdsl.proof import proving
 from lmdsl.proof.checking import faults
 from lmdsl.proof.cover import Cover
-from lmdsl.proof.images import enclosing, places
 from lmdsl.proof.prover import Prover
 from lmdsl.proof.record import Proof
 from lmdsl.proof.tightening import tighten

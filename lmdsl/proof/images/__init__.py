@@ -1,1 +1,1 @@
-"""Images of boxes under the true map: enclosed, along their paths too, and located."""
+"""The boxes of a cover, and their images under a controller."""

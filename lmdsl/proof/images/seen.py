@@ -9,9 +9,9 @@ from lmdsl.machine import threads
 from lmdsl.model.discretization import noise_parts
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.successors.compiled import enclosing, places, tapes
 from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
-from lmdsl.proof.images import enclosing, places, tapes
 from lmdsl.proof.images.pieces import DEEPEST, Integers, Pieces, pieces
 
 SOME = 2**13  # most boxes enclosed at a time by a thread

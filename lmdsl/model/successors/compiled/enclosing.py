@@ -12,7 +12,7 @@ from lmdsl.common.types import Floats
 from lmdsl.formulas.compiled.ends import LEAST, UNIT, down, up
 from lmdsl.formulas.compiled.machine import BLOCK, registers, run
 from lmdsl.machine.kernels import kernel
-from lmdsl.proof.images.tapes import Step, Tapes
+from lmdsl.model.successors.compiled.tapes import Step, Tapes
 
 HERMITE = 2.0**-46  # relative error of a computed point of an arc, generously
 

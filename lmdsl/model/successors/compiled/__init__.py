@@ -1,0 +1,1 @@
+"""Images of many boxes by compiled loops: enclosed, along their paths too, and located."""
