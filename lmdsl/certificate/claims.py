@@ -20,10 +20,13 @@ A solver's status plays no part. A claim that almost holds is repaired or refuse
 """
 
 from dataclasses import dataclass, field, fields
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from lmdsl.common.records import jsonable
 from lmdsl.common.types import Floats, Policy
+
+# Of claim 7: proved or not, under constants that are only promised, or not claimed (None).
+Safe = bool | Literal["assumed"] | None
 
 CLAIMS = ("stabilizing", "upper_bound", "lower_bound", "measure")
 
@@ -51,7 +54,8 @@ class Certificate:
     assumes
         On what every claim rests beside the finite model; empty where on nothing.
     safe
-        Claim 7; None where successors are not enclosed, or nothing is claimed of a policy.
+        Claim 7; None where successors are not enclosed, or nothing is claimed of a policy;
+        ``"assumed"`` where it rests on Lipschitz constants of a Python function: that is no proof.
     """
 
     stabilizing: bool
@@ -67,7 +71,7 @@ class Certificate:
     tolerance: float
     reasons: tuple[str, ...] = ()
     assumes: str = ""
-    safe: bool | None = None
+    safe: Safe = None
 
     @property
     def verified(self) -> bool:
@@ -80,12 +84,13 @@ class Certificate:
         if not self.verified:
             return "; ".join(self.reasons)
         rests = f", assuming that {self.assumes}" if self.assumes else ""
-        return f"verified, gap {self.gap:.2g}{rests}"
+        safe = "; that no run is lost is assumed, not proved" * (self.safe == "assumed")
+        return f"verified, gap {self.gap:.2g}{rests}{safe}"
 
     @property
-    def claims(self) -> dict[str, bool | None]:
+    def claims(self) -> dict[str, Safe]:
         """Which claims hold, by name; None is one that is not made."""
-        kinds = (bool, bool | None)
+        kinds = (bool, Safe)
         return {f.name: getattr(self, f.name) for f in fields(self) if f.type in kinds}
 
     def to_dict(self) -> dict[str, Any]:

@@ -222,7 +222,7 @@ def _certificate(
     assumes = lp.problem.system.assumes
     return Certificate(
         **said, gap=gap, tolerance=tolerance, reasons=tuple(reasons), assumes=assumes,
-        safe=None if unsafe is None else not unsafe,
+        safe=safety.claim(lp, unsafe),
     )  # fmt: skip
 
 

@@ -197,6 +197,8 @@ def _enclosed(result: Any) -> str:
     if safe is None:
         return sure
     claim = "no run of the map as compiled is lost (claim 7)" if safe else "claim 7 is not proved"
+    if safe == "assumed":
+        claim = "no run is lost, assuming the Lipschitz constants (claim 7 is assumed, not proved)"
     return f"{claim}; {sure}; the lower bound speaks of surviving pairs"
 
 

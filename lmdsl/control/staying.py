@@ -11,6 +11,7 @@ from lmdsl.model.local.holding import Controls, HoldingLaw
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus, sets_of
 from lmdsl.model.successors.inclusion import Inclusion
+from lmdsl.systems import FunctionSystem
 
 
 def check_of(
@@ -42,9 +43,9 @@ def check_of(
 def _enclosed(lp: StabilizationLP, hold: Controls, deadline: Deadline) -> int | None:
     """Count the cells that hold by all that images can meet; None where samples were compiled.
 
-    It is none where the time is up before the last is proved.
+    It is none where the time is up before the last is proved. Nothing is proved of a function.
     """
-    if lp.problem.successors != "enclosed":
+    if lp.problem.successors != "enclosed" or isinstance(lp.problem.system, FunctionSystem):
         return None
     cells = np.flatnonzero(hold >= 0)
     guard = partial(deadline.raise_if_over, "checking the local controller")

@@ -29,11 +29,14 @@ class TrueMap:
         The map on named arrays.
     names
         Of the states, the controls, and the noise.
+    steepness
+        Lipschitz constants that are promised of a Python function; None where none are.
     """
 
     def __init__(self, problem: Problem, partition: Partition) -> None:
         self.problem, self.partition = problem, partition
         self.map: StateMap = problem.step()
+        self.steepness = problem.system.promised(problem.states, problem.noises)
         self.names = (*problem.states, *problem.controls, *problem.noises)
 
     def named(self, x: Sequence[Any], u: Sequence[Any], w: Sequence[Any]) -> dict[str, Any]:

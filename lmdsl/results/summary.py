@@ -5,6 +5,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from lmdsl.certificate.claims import Safe
 from lmdsl.common.records import Frozen, Reported, jsonable
 from lmdsl.common.types import Statuses
 from lmdsl.control.accuracy import IntegrationError
@@ -202,7 +203,7 @@ class Summary(Frozen):
         return None if levels is None else int((levels > 0).sum())
 
     @property
-    def claims(self) -> dict[str, bool | None]:
+    def claims(self) -> dict[str, Safe]:
         """Which claims of the certificate hold, by name; None is one that is not made."""
         proof = getattr(self, "certificate", None)
         return {} if proof is None else dict(proof.claims)

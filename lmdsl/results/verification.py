@@ -83,7 +83,11 @@ class Verification:
         lines += [f"  {printable(sentence)}" for sentence in (*self.reasons, *self.notes)]
         if proof.assumes:
             lines.append(f"  assumed: {proof.assumes}")
-        scope = self.scope + "; safe of the map as compiled" * bool(proof.safe)
+        scope = self.scope
+        if proof.safe == "assumed":
+            lines.append("  assumed, not proved: that no run of the map is lost (claim 7)")
+        elif proof.safe:
+            scope += "; safe of the map as compiled"
         return "\n".join([*lines, f"  (claims speak of {scope})"])
 
     __str__ = text
@@ -179,6 +183,8 @@ def _function_notes(result: Result) -> list[str]:
     notes = [NOT_EVALUATED[functions]]
     if "system" in functions and result.local_controller is not None:
         notes.append("what the local controller does was not checked")
+    if "system" in functions and result.problem.successors == "enclosed":
+        notes.append("what whole cells can meet was not checked: that is asked of the function")
     if "system" in functions and result.problem.terminal_cost is not None:
         notes.append("the terminal cost was not checked: it is paid at images of the function")
     if (result.cell_status == CellStatus.BEYOND_GAMMA).any():

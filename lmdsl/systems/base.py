@@ -6,7 +6,7 @@ Formulas and users' own Python functions meet this one contract, so everything d
 values.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Protocol
 
@@ -21,6 +21,7 @@ from lmdsl.formulas.enclosures import Jet
 from lmdsl.formulas.language import NO_DEFINITIONS, Definitions, Formula, parse
 from lmdsl.formulas.names import Formulas, Parameters
 from lmdsl.formulas.program import Program
+from lmdsl.systems.black_box.steepness import Steepness
 from lmdsl.systems.runge_kutta import RungeKutta
 
 Substeps = Annotated[
@@ -137,6 +138,10 @@ class System(Declared):
     def compile(self, names: Names) -> StateMap:
         """Return the function from named arrays to the images, one array per state in order."""
         raise NotImplementedError
+
+    def promised(self, states: Sequence[str], noise: Sequence[str]) -> Steepness | None:
+        """Return the Lipschitz constants that are promised of a Python function; None: none."""
+        return None
 
     def flow(self, names: Names, integrand: Formula | None = None) -> RungeKutta | None:
         """Return how the differential equation is integrated; None for a map, which has none.

@@ -16,10 +16,14 @@ from lmdsl.systems.base import OF_TIME, Names, StateMap, System
 from lmdsl.systems.black_box.function_map import FunctionMap
 from lmdsl.systems.black_box.returned import Returned
 from lmdsl.systems.black_box.scalar_map import ScalarMap
+from lmdsl.systems.black_box.steepness import Steepness
 
 WHERE = "system.next"
 
 Processes = Annotated[int, Field(strict=True, ge=1, le=1024), BeforeValidator(plain)]
+Constant = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True), BeforeValidator(plain)]
+ConstantRow = Annotated[tuple[Constant, ...], BeforeValidator(plain)]
+Constants = Annotated[tuple[ConstantRow, ...], Field(min_length=1), BeforeValidator(plain)]
 
 
 class FunctionSystem(System):
@@ -40,6 +44,11 @@ class FunctionSystem(System):
         With ``vectorized=False``, how many processes make the calls while a problem is compiled and
         while runs are simulated; None, the default, for the calling one. The function must be
         picklable then, unless processes are forked (``multiprocessing.set_start_method``).
+    lipschitz
+        One row per state, in the order of the axes, of a number per state and, behind these, per
+        noise variable: how much the image changes at most, by a unit of each, anywhere in the box
+        (images not wrapped) and under every control. With it ``successors`` may be ``enclosed``.
+        Samples that contradict it are refused; that no others do is assumed, and said.
 
     Examples
     --------
@@ -58,6 +67,7 @@ class FunctionSystem(System):
     # How it is called changes nothing of what is compiled: no saved result says it.
     vectorized: bool = Field(default=True, strict=True, exclude=True)
     processes: Processes | None = Field(default=None, exclude=True)
+    lipschitz: Constants | None = None
 
     @model_validator(mode="after")
     def _few_at_a_time(self) -> Self:
@@ -73,6 +83,10 @@ class FunctionSystem(System):
     def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
         """Say that no JSON is a function."""
         return {"not": {}}
+
+    def promised(self, states: Sequence[str], noise: Sequence[str]) -> Steepness | None:
+        """See :meth:`System.promised`."""
+        return None if self.lipschitz is None else Steepness(self.lipschitz, states, noise)
 
     def compile(self, names: Names) -> StateMap:
         """See :meth:`System.compile`."""

@@ -246,6 +246,8 @@ class Sampler:
         """Return the images; of a user's function some are asked for again."""
         images = self.step(values)
         self.asked.alone(self.step.func, values, images)
+        if self.true_map.steepness is not None:
+            self.true_map.steepness.require(values, images)
         return images
 
     def _shape(self, block: Block) -> tuple[int, int, int, int]:

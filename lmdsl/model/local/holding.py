@@ -27,7 +27,7 @@ from lmdsl.model.stabilizable_set import CellStatus, keeping
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem.local_control import HoldControl
 from lmdsl.problem.problem import Problem
-from lmdsl.systems import OdeSystem
+from lmdsl.systems import FunctionSystem, OdeSystem
 from lmdsl.systems.named import NamedOde
 
 Controls = NDArray[np.int32]  # by cell, shape (N,): index of its control; -1 where none holds
@@ -141,6 +141,8 @@ def note(problem: Problem, partition: Partition, index: Controls | None) -> str:
         return ""
     held, every = int((index >= 0).sum()), int(CellSets.of(problem, partition).attractor.sum())
     how = "proved of whole cells" if problem.successors == "enclosed" else "by their samples"
+    if isinstance(problem.system, FunctionSystem):
+        how = how.replace("proved of whole cells", "assuming the Lipschitz constants")
     rest = "are a goal that may be left again" if local.partial else "became ordinary cells"
     others = f"; the others {rest}" * (held < every)
     return f"{held} of {every} declared attractor cells hold ({how}){others}"

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Guard, Indices, Progress
-from lmdsl.machine import memory, threads
+from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.assembly.asked import Asked
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors import counting
@@ -114,9 +115,11 @@ def enclosed(
             if admitted is not None:
                 found.out[some] |= ~admitted.reshape(-1)[_offset(admitted.shape[:-1], at)]
 
-    for (_, _, end), _ in zip(work, threads.in_order(fill, work, deadline.cancel), strict=True):
-        if progress:
-            progress("enclose", end / max(count, 1))
+    asked = Asked(grid.encloser.true_map.map)  # a user's function, which threads may not share
+    with asked.helped():
+        for (_, _, end), _ in zip(work, asked.in_order(fill, work, deadline.cancel), strict=True):
+            if progress:
+                progress("enclose", end / max(count, 1))
     return found
 
 

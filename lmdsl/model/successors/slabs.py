@@ -19,8 +19,9 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.discretization import control_vectors, offsets
 from lmdsl.model.grid.axis import AxisCells
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.successors.assumed import encloser_of
 from lmdsl.model.successors.domains import Domain, domains
-from lmdsl.model.successors.enclosing import MOST_PARTS, Encloser, StepBoxes, Stretch
+from lmdsl.model.successors.enclosing import MOST_PARTS, StepBoxes, Stretch
 from lmdsl.model.true_map import TrueMap
 from lmdsl.problem.problem import Problem
 
@@ -66,7 +67,7 @@ class Slabs:
     def __init__(self, problem: Problem, partition: Partition, deadline: Deadline) -> None:
         self.partition = partition
         self.guard = partial(deadline.raise_if_over, "enclosing images")
-        self.encloser = Encloser(TrueMap(problem, partition))
+        self.encloser = encloser_of(TrueMap(problem, partition))
         self.path = problem.judged == "path"
         self.domains: tuple[Domain, ...] = domains(partition, offsets(problem))
         self.controls = np.ascontiguousarray(control_vectors(problem).T)

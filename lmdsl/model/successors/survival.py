@@ -22,6 +22,7 @@ from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
+from lmdsl.model.successors.assumed import require_samples_within
 from lmdsl.model.successors.counting import drop, hulls, keep, lift, table
 from lmdsl.model.successors.ranges import enclosed
 from lmdsl.problem.problem import Problem
@@ -73,6 +74,8 @@ class Successors:
         hulls(fixed(pointer), fixed(first), fixed(last), least, most)
         ranges, reach = (fixed(first), fixed(last)), (fixed(least), fixed(most))
         admissible = ~found.out
+        if "system" in problem.functions:
+            require_samples_within(transitions, partition, (first, last), admissible)
         if way is not None:
             keep(table(sets.avoid, partition), *ranges, admissible)
         return cls(transitions, partition, admissible, ranges, reach, deadline)

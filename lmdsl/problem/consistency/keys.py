@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING, Any
 from lmdsl.common import spelling
 from lmdsl.common.faults import require_all, written
 from lmdsl.errors import BadInput, shown
-from lmdsl.problem.consistency import endings, texts
+from lmdsl.problem.consistency import enclosing, endings, texts
 from lmdsl.problem.local_control import (
     ConstantControl,
     HoldControl,
     LinearFeedback,
     LqrFeedback,
 )
-from lmdsl.problem.noise import NoiseNormal
-from lmdsl.systems import FunctionSystem, MapSystem, MatrixSystem, OdeSystem
+from lmdsl.systems import MapSystem, MatrixSystem, OdeSystem
 from lmdsl.systems.named import NamedOde
 
 if TYPE_CHECKING:
@@ -47,7 +46,7 @@ def require_consistent(problem: "Problem") -> None:
     """Refuse a problem whose keys do not fit together; every fault is named."""
     checks = (
         _unique_names, endings.require_fit, endings.require_end, _one_cost, _sets_named,
-        _local_named, _enclosable,
+        _local_named, enclosing.require_enclosable, enclosing.require_constants,
     )  # fmt: skip
     require_all(
         [
@@ -102,26 +101,6 @@ def _one_cost(problem: "Problem") -> None:
         raise BadInput(
             f"a {what} has no time between its steps; write a stage_cost, or an ode", "cost_rate"
         )
-
-
-def _enclosable(problem: "Problem") -> None:
-    """Refuse enclosed successors of what cannot be enclosed."""
-    if problem.successors != "enclosed":
-        return
-    if isinstance(problem.system, FunctionSystem | MatrixSystem):
-        kind = problem.system.kind
-        raise BadInput(
-            f"a system of kind {kind!r} has no formulas to enclose; write its formulas, or leave "
-            "this key out",
-            "successors",
-        )
-    for name, noise in (problem.noise or {}).items():
-        if isinstance(noise, NoiseNormal) and noise.normal.within is None:
-            raise BadInput(
-                "normal noise has no bound that successors could be enclosed for; say how many "
-                'standard deviations they cover, for example "within": 4',
-                f"noise.{name}.normal",
-            )
 
 
 def _sets_named(problem: "Problem") -> None:

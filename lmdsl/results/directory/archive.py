@@ -286,7 +286,8 @@ def _problem(data: Any, files: Reading) -> Problem:
 
 def _system(system: dict[str, Any], kind: str, files: Reading) -> Any:
     if kind == "function":
-        return FunctionSystem(next=_not_stored, parameters=system.get("parameters", {}))
+        known = {key: system[key] for key in ("parameters", "lipschitz") if key in system}
+        return FunctionSystem(next=_not_stored, **known)
     if kind in GIVEN:
         return _matrices(GIVEN[kind], system, files)
     if "judged" not in system and (kind == "ode" or issubclass(NAMED.get(kind, System), NamedOde)):

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar, get_type_hints
 
 from pydantic import BeforeValidator, ConfigDict, Field, create_model
 
+from lmdsl.certificate.claims import Safe
 from lmdsl.common.files import joined
 from lmdsl.common.strict_model import Declared, plain
 from lmdsl.control.invariance import LocalCheck
@@ -101,7 +102,7 @@ class CertificateFile(_Keys):
     data: Annotated[DataReport | None, _record(DataReport)] = None
     beyond_gamma: dict[str, Any] | None = None
     cause: Word[Cause | None]
-    claims: dict[str, bool | None]
+    claims: dict[str, Safe]
     measure_residual: Bound | None
     reasons: List[str]
     iterations: int | None

@@ -100,7 +100,7 @@ def _head(result: Result, lp: StabilizationLP, refused: bool) -> dict[str, Any]:
         for name in ("tolerance", "cost", "lower_bound", "contraction"):
             value = getattr(result, name)
             head[name] = None if value is None else float(value).hex()
-        if lp.problem.successors == "enclosed":
+        if lp.problem.successors == "enclosed" and "system" not in lp.problem.functions:
             head["map"] = described(lp)
     return head
 
