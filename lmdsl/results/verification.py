@@ -30,12 +30,8 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.results.directory import archive, repaired
-from lmdsl.results.directory.audit import (
-    NOT_EVALUATED,
-    differences,
-    function_differences,
-    local_differences,
-)
+from lmdsl.results.directory.audit import differences, local_differences
+from lmdsl.results.directory.functions import function_differences, function_notes
 from lmdsl.results.directory.proved import proof_findings
 from lmdsl.results.directory.recorded import policy_of
 from lmdsl.results.directory.repaired import Judge
@@ -151,7 +147,7 @@ def verify(
     in_time()
     if result.problem.functions:
         reasons += function_differences(lp, result)
-        notes = _function_notes(result) + notes
+        notes = function_notes(result) + notes
     lp = _restricted(lp, result, reasons, judge)
     same = result.model_sha256 in (lp.digest, archive.identity(lp))
     if not same:
@@ -175,21 +171,6 @@ def verify(
     )
     system = result.problem.system
     return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
-
-
-def _function_notes(result: Result) -> list[str]:
-    """Return what was not checked where the problem has Python functions."""
-    functions = result.problem.functions
-    notes = [NOT_EVALUATED[functions]]
-    if "system" in functions and result.local_controller is not None:
-        notes.append("what the local controller does was not checked")
-    if "system" in functions and result.problem.successors == "enclosed":
-        notes.append("what whole cells can meet was not checked: that is asked of the function")
-    if "system" in functions and result.problem.terminal_cost is not None:
-        notes.append("the terminal cost was not checked: it is paid at images of the function")
-    if (result.cell_status == CellStatus.BEYOND_GAMMA).any():
-        notes.append("that gamma is infeasible from the cells left out was not checked")
-    return notes
 
 
 def _restricted(
