@@ -11,6 +11,7 @@ from lmdsl.model.successors.compiled import enclosing
 from lmdsl.problem.problem import Problem
 from lmdsl.proof.images.pieces import pieces
 from lmdsl.proof.images.seen import BoxImages
+from lmdsl.proof.optimum.moves import Game
 
 
 class Loop(NamedTuple):
@@ -49,6 +50,13 @@ class Loop(NamedTuple):
     def images(self, slack: float = 0.0) -> BoxImages:
         """Return what encloses images of boxes."""
         return BoxImages(self.problem, self.partition, self.status, self.control, slack)
+
+    def game(self, slack: float = 0.0) -> Game:
+        """Return the choice of controls that every law has."""
+        cells, least, _ = self.entry(self.images())
+        entry = np.full(self.partition.size, np.inf)
+        entry[cells] = least
+        return Game(self.problem, self.partition, self.status, entry, slack)
 
     def entry(self, images: BoxImages) -> tuple[Indices, Floats, Floats]:
         """Return the attractor cells, and bounds of what is paid on entering each."""

@@ -15,6 +15,7 @@ from lmdsl.formulas.compiled.machine import IntervalTape
 from lmdsl.formulas.compiled.tape import ONE, ZERO, Value, Writer
 from lmdsl.formulas.compiled.traced import Traced, trace
 from lmdsl.formulas.program import Program
+from lmdsl.problem.consistency import texts
 from lmdsl.problem.problem import Problem
 from lmdsl.systems.runge_kutta import RungeKutta, rk4
 
@@ -103,6 +104,19 @@ def step(problem: Problem) -> Step:
         getattr(advances, "substeps", 1), path,
         (len(states), make.components, len(names[0]), len(names[1])),
     )  # fmt: skip
+
+
+def admitted(problem: Problem) -> Tapes | None:
+    """Return what is 1 where a pair is admissible and 0 where not; None: nothing is known."""
+    if problem.admissible is None:
+        return None
+    try:
+        formula = problem.formula(f"where({problem.admissible}, 1, 0)", "admissible", texts.PAIRS)
+    except BadInput:  # it is as long as a formula may be
+        return None
+    names = (problem.controls, problem.noises)
+    plain = _Maker(problem.states, names, len(problem.states), seeded=True)
+    return plain.program(problem.program(formula))
 
 
 class _Maker:
