@@ -35,6 +35,8 @@ def add(command: Command) -> None:
     shared(prove, "dir")
     prove.add_argument("--target", type=float, default=0.999, metavar="T",
                        help="share that is to arrive (default 0.999)")  # fmt: skip
+    prove.add_argument("--bracket", action="store_true",
+                       help="bound what any control law costs, too")  # fmt: skip
     shared(prove, "--time-limit", "--json")
 
     plot = command("plot", _plot, "Draw the figures of a saved result.")
@@ -84,7 +86,9 @@ def _prove(parsed: Arguments) -> int:
 
     result = Result.load(parsed.dir)
     with ProgressLine() as progress:
-        proof = result.prove(parsed.target, parsed.time_limit, progress=progress)
+        proof = result.prove(
+            parsed.target, parsed.time_limit, bracket=parsed.bracket, progress=progress
+        )
     proved.add(parsed.dir, result, proof)
     answer(parsed, proof)
     return 0 if proof.reached else 1

@@ -12,6 +12,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import settling
 from lmdsl.proof.cover import Cover, node_bytes
 from lmdsl.proof.loop import Loop
+from lmdsl.proof.optimum.bracket import bound as best
 from lmdsl.proof.prover import Prover
 from lmdsl.proof.record import Proof
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
@@ -24,18 +25,26 @@ SLACK = 2.0**-36
 # Without a time limit bounds of the cost are tightened until there are so many times as many boxes,
 # or so many.
 GROWN, FEW = 4, 200_000
+BRACKET = 0.4  # part of a time limit that is kept for a lower bound of what any law costs
 DECIDING = 0.7  # part of a time limit after which no more is decided, and bounds are tightened
 
 
 def prove(
-    loop: Loop, target: float, deadline: Deadline, holds: bool | None, progress: Progress | None
-) -> Proof:
-    """Prove what becomes of the volume of C, until the target is reached or nothing helps."""
+    loop: Loop, target: float, deadline: Deadline, holds: bool | None, progress: Progress | None,
+    bracket: bool = False,
+) -> Proof:  # fmt: skip
+    """Prove what becomes of the volume of C, until the target is reached or nothing helps.
+
+    For a ``bracket``, bound from below what any law costs there, too.
+    """
     began = time.monotonic()
     images, partition = loop.images(SLACK), loop.partition
     each = node_bytes(partition.dimension, len(images.noise[0]))
     memory.require(3.0 * each * partition.size, "the boxes of the proof")
-    left = deadline.left
+    whole, left = deadline, deadline.left
+    if bracket and left is not None:
+        left *= 1.0 - BRACKET
+        deadline = Deadline(left)
     prover = Prover(Cover(partition, loop.status), images, loop.factor, loop.entry(images))
 
     def enough(shares: Floats) -> bool:
@@ -48,8 +57,16 @@ def prove(
     few = max(GROWN * len(prover.cover.leaves()), FEW)
     tighten(prover, lambda boxes: left is None and boxes > few, deadline, progress)
     arrays = boxes(prover)
+    del prover
+    bound = best(loop, _most(arrays), whole, progress, SLACK) if bracket else None
     seconds = time.monotonic() - began
-    return Proof.of(arrays, loop, seconds=seconds, holds=holds, target=target)
+    return Proof.of(arrays, loop, seconds=seconds, holds=holds, target=target, bound=bound)
+
+
+def _most(arrays: dict[str, NDArray[Any]]) -> float:
+    """Return more than any upper bound of boxes that arrive: larger lower bounds are of no use."""
+    cost = arrays["cost"][arrays["class"] == ARRIVES]
+    return 2.0 * float(cost[np.isfinite(cost)].max(initial=1.0))
 
 
 def boxes(prover: Prover) -> dict[str, NDArray[Any]]:

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Floats
 from lmdsl.proof.loop import Loop
+from lmdsl.proof.optimum.averages import Bracket, mean, volumes
+from lmdsl.proof.optimum.bracket import Optimum
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
 
 _WITNESSES = {
@@ -23,15 +25,22 @@ ARRAYS: dict[str, tuple[bool, str]] = {  # by axis too, and the kind
     "cell": (False, "<i8"), "split": (True, "|u1"), "place": (True, "<u4"), "class": (False, "|u1"),
     "level": (False, "<i4"), "cost": (False, "<f8"), "lower": (False, "<f8"),
 }  # fmt: skip
+BOUND: dict[str, str] = {"optimum_split": "|u1", "optimum": "<f8"}  # of a bracket
 BOX = 40  # bytes of a box but for its axes
 
 
-def expected(boxes: int, axes: int) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Return the shapes and kinds of the arrays of so many boxes."""
-    return {
+def expected(
+    boxes: int, axes: int, parts: int | None = None
+) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Return the shapes and kinds of the arrays of so many boxes, and of the parts of a bound."""
+    shapes: dict[str, tuple[tuple[int, ...], str]] = {
         name: ((boxes, axes) if by_axis else (boxes,), kind)
         for name, (by_axis, kind) in ARRAYS.items()
     }
+    if parts is not None:
+        sizes = (axes,), (parts,)
+        shapes |= {n: (size, k) for (n, k), size in zip(BOUND.items(), sizes, strict=True)}
+    return shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +76,17 @@ class Proof(Frozen):
     cost_above, cost_below
         Bounds of the cost of a run from there (with noise ``cost_below`` of the mean too); 0
         unless it arrives.
+    optimum
+        Of a bracket: bounds of the average over what arrives of the least cost that any control law
+        has there, by volume; None without one, or where nothing arrives.
+    nonnegative
+        Whether costs are proved not to be negative, as the lower bound needs it: else it is
+        assumed. None without a bracket.
+    bound
+        The lower bound, on 2^``split`` equal parts of every cell; None without a bracket.
+    maps
+        Its means over what arrives of each cell, and those of ``cost_above``, shape (N,) each; NaN
+        where nothing arrives.
     """
 
     arrives: float
@@ -88,11 +108,15 @@ class Proof(Frozen):
     cost_above: Floats
     cost_below: Floats
     to_stay: bool = False
+    optimum: tuple[float, float] | None = None
+    nonnegative: bool | None = None
+    bound: Optimum | None = None
+    maps: tuple[Floats, Floats] | None = None
 
     @classmethod
     def of(
         cls, arrays: dict[str, NDArray[Any]], loop: Loop, *, seconds: float, holds: bool | None,
-        target: float,
+        target: float, bound: Optimum | None = None,
     ) -> Self:  # fmt: skip
         """Return the proof that boxes are."""
         kind, volume = arrays["class"], volumes(arrays["split"])
@@ -112,13 +136,15 @@ class Proof(Frozen):
         arriving = kind == ARRIVES
         weight, cost, steps = volume[arriving], None, None
         if arriving.any():
-            low, high = (_mean(arrays[name][arriving], weight) for name in ("lower", "cost"))
+            low, high = (mean(arrays[name][arriving], weight) for name in ("lower", "cost"))
             cost, steps = (low, high), int(arrays["level"][arriving].max())
+        bracket = Bracket.of(arrays, loop, bound) if bound is not None else Bracket()
         witnesses = {"lost": middle(LOST), "stays": middle(STAYS), "undecided": middle(UNDECIDED)}
         return cls(
             share(ARRIVES), share(LOST), share(STAYS), share(UNDECIDED), steps, cost, len(kind),
             seconds, holds, target, witnesses, arrays["cell"], arrays["split"], arrays["place"],
             kind, arrays["level"], arrays["cost"], arrays["lower"], loop.to_stay,
+            *bracket,
         )  # fmt: skip
 
     @property
@@ -128,12 +154,23 @@ class Proof(Frozen):
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of proof.npz."""
-        found = (self.cell, self.split, self.place, self.kind, self.level, self.cost_above,
-                 self.cost_below)  # fmt: skip
+        found: tuple[NDArray[Any], ...] = (
+            self.cell, self.split, self.place, self.kind, self.level, self.cost_above,
+            self.cost_below,
+        )  # fmt: skip
+        kinds = {name: kind for name, (_, kind) in ARRAYS.items()}
+        if self.bound is not None:
+            kinds |= BOUND
+            found += (self.bound.split, self.bound.bound)
         return {
             name: np.ascontiguousarray(array, dtype=kind)
-            for (name, (_, kind)), array in zip(ARRAYS.items(), found, strict=True)
+            for (name, kind), array in zip(kinds.items(), found, strict=True)
         }
+
+    @property
+    def parts(self) -> int | None:
+        """Number of parts on which the lower bound is; None without one."""
+        return None if self.bound is None else len(self.bound.bound)
 
     @property
     def sha256(self) -> str:
@@ -146,7 +183,7 @@ class Proof(Frozen):
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         names = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes", "seconds",
-                 "holds", "witnesses")  # fmt: skip
+                 "holds", "witnesses", "optimum", "nonnegative", "parts")  # fmt: skip
         return {name: jsonable(getattr(self, name)) for name in names}
 
     def text(self) -> str:
@@ -162,6 +199,13 @@ class Proof(Frozen):
                 f"  what arrives does so in at most {self.steps} steps; its average cost lies "
                 f"between {low:.6g} and {high:.6g}"
             )
+        if self.optimum is not None:
+            low, high = self.optimum
+            assumed = "" if self.nonnegative else ", if no cost is negative, which is assumed"
+            lines.append(
+                f"  what any control law costs there is at least {low:.6g} on average, and need "
+                f"not be more than {high:.6g}{assumed}"
+            )
         lines += [
             f"  {words}, for example from ({', '.join(f'{x:.9g}' for x in found)})"
             for name, words in _WITNESSES.items()
@@ -174,17 +218,6 @@ class Proof(Frozen):
         return "\n".join(lines)
 
     __str__ = text
-
-
-def volumes(split: NDArray[np.uint8]) -> Floats:
-    """Return the volumes of boxes, in cells."""
-    return np.asarray(2.0 ** -split.sum(axis=1, dtype=np.float64))
-
-
-def _mean(x: Floats, weight: Floats) -> float:
-    if not np.isfinite(x).all():
-        return float(np.where(np.isfinite(x), 0.0, x).sum())
-    return math.fsum(x * weight) / math.fsum(weight)
 
 
 def _percent(share: float) -> str:

@@ -273,6 +273,7 @@ class Result(Summary):
         target: float = 0.999,
         time_limit: float | None = None,
         *,
+        bracket: bool = False,
         progress: Progress | None = None,
     ) -> Proof:
         """Prove what becomes of C under the controller: of the true map, by volume.
@@ -283,6 +284,9 @@ class Result(Summary):
             Share of the volume of C that is to be proved to arrive.
         time_limit
             Seconds after which what is proved so far is the answer.
+        bracket
+            Whether to bound from below what any control law costs, too, for the average over what
+            arrives.
         progress
             Called with (stage, fraction done).
 
@@ -293,7 +297,7 @@ class Result(Summary):
         """
         from lmdsl.results.directory.proved import prove
 
-        return prove(self, target, time_limit, progress)
+        return prove(self, target, time_limit, progress, bracket)
 
     @own_arithmetic
     def save(self, path: str | os.PathLike[str]) -> None:

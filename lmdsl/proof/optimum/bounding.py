@@ -4,10 +4,10 @@ T W(b) = min over controls of [cost + factor times the sum over parts of the noi
 the least W that is met]. What is found satisfies W <= T W (docs/mathematics.md).
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.machine import threads
@@ -15,7 +15,6 @@ from lmdsl.machine.kernels import kernel
 from lmdsl.proof.optimum.moves import Game, Grid, Moves
 
 SLACK = 2.0**-40  # by how much bounds are lowered, relative: see settling.py
-CHECKED = 2.0**-50  # by how much they are when they are checked: at least what rounds
 MOST_MET = 2**16  # parts above which a range counts as all parts
 CLOSE = 1e-4  # relative rise a sweep below which a bound from below is good enough
 SWEEPS = 30  # after which a bound that has to be lowered still is given up
@@ -46,11 +45,17 @@ class Sweep(NamedTuple):
     numbers: tuple[float, float, float, float]
 
 
+def rounding(parts: int) -> float:
+    """Return by how much sums over parts of the noise round at most, relative, generously."""
+    return (parts + 8) * 2.0**-52
+
+
 def prepared(game: Game, grid: Grid, moves: Moves, most: float, slack: float) -> Sweep:
     """Return what sweeps of a grid need."""
     cell = grid.cell(game.partition, np.arange(grid.size))
     free = ~np.isfinite(game.entry[cell]) & ~game.avoided[cell]
     least = float(game.entry.min(initial=np.inf))
+    slack += rounding(len(game.weight))
     return Sweep(
         moves, grid.shape, grid.stride, game.weight, free, (game.factor, slack, least, most)
     )
@@ -66,26 +71,26 @@ def settle(sweep: Sweep, W: Floats, order: Indices, guard: Guard, above: bool) -
     while True:
         guard()
         parts = [free[i : i + AT_A_TIME] for i in range(0, len(free), AT_A_TIME)]
-        lowest = float(W.min(initial=np.inf))
-        change = threads.each(lambda some: lower(sweep, some, W, lowest, step), parts)
+        one = partial(lower, sweep, W, float(W.min(initial=np.inf)), step)
+        change = threads.each(one, parts)
         if max(change, default=0.0) <= (0.0 if above else CLOSE):
             return True
 
 
 def consistent(sweep: Sweep, W: Floats, order: Indices) -> bool:
-    """Lower W where it exceeds T W, as it may where finer parts are enclosed worse than coarse ones.
+    """Lower W where it exceeds T W, as it may where finer parts are enclosed worse.
 
     Return whether W <= T W then.
     """
     free = order[sweep.free[order]]
     for _ in range(SWEEPS):
-        if lower(sweep, free, W, float(W.min(initial=np.inf)), -1) == 0.0:
+        if lower(sweep, W, float(W.min(initial=np.inf)), -1, free) == 0.0:
             return True
     return False
 
 
 @kernel
-def lower(sweep, parts, W, lowest, way):  # type: ignore[no-untyped-def]
+def lower(sweep, W, lowest, way, parts):  # type: ignore[no-untyped-def]
     """Replace W by T W on parts where that is lower (way -1) or higher (1).
 
     Return the largest relative change. ``lowest`` is at most all of W.
@@ -112,7 +117,7 @@ def violated(sweep, W, lowest, fault):  # type: ignore[no-untyped-def]
 def best(sweep, b, W, lowest):  # type: ignore[no-untyped-def]
     """Return T W on a part, rounded down."""
     factor, slack, entry, _ = sweep.numbers
-    moves, R, parts = sweep.moves, len(sweep.weight), len(W)
+    moves, R = sweep.moves, len(sweep.weight)
     each = len(moves.cost) // len(moves.seam)
     found, piece = np.inf, b
     while piece >= 0:

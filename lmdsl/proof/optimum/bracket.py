@@ -1,4 +1,4 @@
-"""From a closed loop to a lower bound of the cost of every control law, on finer and finer parts."""
+"""From a closed loop to a lower bound of the cost of every law, on finer and finer parts."""
 
 import time
 from typing import NamedTuple
@@ -10,13 +10,11 @@ from lmdsl.common.types import Floats, Indices, Progress
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline, Stopped
-from lmdsl.machine.kernels import kernel
 from lmdsl.proof.loop import Loop
-from lmdsl.proof.optimum.bounding import SLACK, Sweep, consistent, prepared, settle
-from lmdsl.proof.optimum.moves import DEEPEST, Game, Grid, Moves
+from lmdsl.proof.optimum.bounding import SLACK, consistent, prepared, settle
+from lmdsl.proof.optimum.moves import DEEPEST, Game, Grid
 
 FEW = 2**22  # rows up to which cells are cut without a time limit
-BEYOND = 2.0  # by how much bounds are larger than any upper bound of which they are the other end
 GROWS = 1.5  # by how much more the time grows than the rows
 Cut = NDArray[np.uint8]
 
@@ -30,10 +28,13 @@ class Optimum(NamedTuple):
         Cells are cut into 2^``split`` equal parts by axis, shape (d,).
     bound
         By part, in C order: at least what any law costs from there; infinite in ``avoid``.
+    nonnegative
+        Whether costs are proved not to be negative, which else is assumed.
     """
 
     split: Cut
     bound: Floats
+    nonnegative: bool
 
 
 def bound(
@@ -46,14 +47,14 @@ def bound(
     game, d = loop.game(slack), loop.partition.dimension
     split = np.zeros(d, dtype=np.int64)
     grid = Grid.of(loop.partition, split)
-    known = Optimum(split.astype(np.uint8), ends(game, grid))
+    known = Optimum(split.astype(np.uint8), ends(game, grid), not game.negative)
     order = np.arange(grid.size)
     while True:
         began = time.monotonic()
         W = _bounded(game, grid, (known, order), most, deadline)
         if W is None:
             return known
-        known = Optimum(grid.split.astype(np.uint8), W)
+        known = Optimum(grid.split.astype(np.uint8), W, not game.negative)
         if progress is not None:
             progress("bound", -1.0)
         growth = _room(game, grid, time.monotonic() - began, deadline)
@@ -115,37 +116,5 @@ def ends(game: Game, grid: Grid) -> Floats:
 def carried(of: Loop | Game, known: Optimum, grid: Grid) -> Floats:
     """Return a bound on finer parts."""
     old = Grid.of(of.partition, known.split.astype(np.int64))
-    index = grid.index(np.arange(grid.size)) >> (grid.split - old.split)
+    index = grid.by_axis(np.arange(grid.size)) >> (grid.split - old.split)
     return np.asarray(known.bound[(index * old.stride).sum(axis=1)])
-
-
-def means(optimum: Optimum, loop: Loop, boxes: dict[str, NDArray[np.generic]]) -> Floats:
-    """Return the mean of a bound over each of some boxes: arrays of a proof, shape (B,)."""
-    grid = Grid.of(loop.partition, optimum.split.astype(np.int64))
-    index = np.stack(loop.partition.multi_index(boxes["cell"]), axis=-1)
-    found = np.zeros(len(index))
-    _means(optimum.bound, (grid.split, grid.stride), index, boxes["split"], boxes["place"], found)
-    return found
-
-
-@kernel
-def _means(bound, grid, index, split, place, found):  # type: ignore[no-untyped-def]
-    fine, stride = grid
-    d = len(fine)
-    for b in range(len(found)):
-        count, first = 1, np.int64(0)
-        for k in range(d):
-            s, p = np.int64(split[b, k]), np.int64(place[b, k])
-            less = fine[k] - s
-            at = p >> -less if less < 0 else p << less
-            first += ((index[b, k] << fine[k]) + at) * stride[k]
-            count *= np.int64(1) << max(less, 0)
-        total = 0.0
-        for j in range(count):
-            rest, at = np.int64(j), first
-            for k in range(d - 1, -1, -1):
-                less = max(fine[k] - np.int64(split[b, k]), 0)
-                at += (rest & ((np.int64(1) << less) - 1)) * stride[k]
-                rest >>= less
-            total += bound[at]
-        found[b] = total / count

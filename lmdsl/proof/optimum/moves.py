@@ -15,10 +15,10 @@ from lmdsl.machine import memory, threads
 from lmdsl.model.discretization import control_vectors, node_count
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.model.successors.compiled import enclosing, places, tapes
 from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.noise import NoiseNormal
 from lmdsl.problem.problem import Problem
-from lmdsl.proof.images import enclosing, places, tapes
 from lmdsl.proof.images.pieces import pieces
 
 AT_A_TIME = 2**14  # most boxes enclosed at a time by a thread
@@ -62,14 +62,14 @@ class Grid(NamedTuple):
         stride = np.append(np.cumprod(shape[:0:-1])[::-1], 1).astype(np.int64)
         return cls(split, shape, stride, int(np.prod(shape.astype(object))))
 
-    def index(self, part: Indices) -> Indices:
+    def by_axis(self, part: Indices) -> Indices:
         """Return the index of parts by axis, shape (len(part), d)."""
         return np.asarray(part[:, None] // self.stride % self.shape)
 
     def cell(self, partition: Partition, part: Indices) -> Indices:
         """Return the cells of parts."""
         stride = np.array([axis.stride for axis in partition.axes]).astype(np.int64)
-        return np.asarray(((self.index(part) >> self.split) * stride).sum(axis=1))
+        return np.asarray(((self.by_axis(part) >> self.split) * stride).sum(axis=1))
 
 
 class Game:
@@ -118,7 +118,7 @@ class Game:
         """Return what every control may do on every part."""
         part = np.arange(grid.size)
         cell = grid.cell(self.partition, part)
-        place = grid.index(part) & ((1 << grid.split) - 1)
+        place = grid.by_axis(part) & ((1 << grid.split) - 1)
         split = np.broadcast_to(grid.split, place.shape)
         boxes = pieces(self.partition, cell, split, place)
         seam = np.full(len(boxes.owner), -1, dtype=np.int32)
@@ -162,19 +162,19 @@ class Game:
         found.span[rows] = span
         found.enters[rows] = (flags & places.MAY_ARRIVE) > 0
         found.cost[rows] = np.maximum(cost, 0.0)
-        free = np.repeat(self.status[cell] != CellStatus.ATTRACTOR, M * R)
+        free = np.repeat(~self.avoided[cell] & ~np.isfinite(self.entry[cell]), M * R)
         return bool((cost[free] < 0).any())
 
-    def _seen(self, given: enclosing.Given, start: Floats) -> tuple[Indices, Indices, Floats]:
+    def _seen(
+        self, given: enclosing.Given, start: Floats
+    ) -> tuple[Indices, NDArray[np.uint8], Floats]:
         d = self.partition.dimension
         found = enclosing.enclose(self.step, given)
         image = np.empty((len(found.low), d, 2), dtype=np.int64)
         flags = np.zeros(len(found.low), dtype=np.uint8)
         clip = self.partition.clip
         with np.errstate(all="ignore"):
-            places.locate_images(
-                found.low, found.high, self.axes, clip, self.slack, image, flags
-            )
+            places.locate_images(found.low, found.high, self.axes, clip, self.slack, image, flags)
             if self.step.path:
                 ground = (self.axes, self.kind, clip, enclosing.HERMITE)
                 places.follow(found, start, ground, flags)

@@ -71,6 +71,9 @@ class ProofKeys(_Keys):
     holds: bool | None
     target: float
     sha256: str = ""
+    optimum: Annotated[tuple[Bound, Bound] | None, BeforeValidator(plain)] = None
+    nonnegative: bool | None = None
+    parts: Annotated[int, Field(ge=0, lt=2**31)] | None = None
 
 
 class CertificateFile(_Keys):

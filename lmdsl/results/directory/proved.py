@@ -15,6 +15,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof import checking
 from lmdsl.proof.loop import Loop
+from lmdsl.proof.optimum.checking import checked
 from lmdsl.proof.proving import prove as proved
 from lmdsl.proof.record import BOX, Proof, expected
 from lmdsl.results.directory import reading, repaired, writing
@@ -23,21 +24,22 @@ from lmdsl.results.directory.reading import Reading
 from lmdsl.results.result import Result
 
 NAME = "proof.npz"
-SHARES = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes")
+SHARES = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes", "optimum")
 
 
 def prove(
-    result: Result, target: float, time_limit: float | None, progress: Progress | None = None
-) -> Proof:
+    result: Result, target: float, time_limit: float | None, progress: Progress | None = None,
+    bracket: bool = False,
+) -> Proof:  # fmt: skip
     """Prove what becomes of C under the controller of a result; see :meth:`Result.prove`."""
     if not (inputs.is_number(target) and 0 < target <= 1):
         raise BadInput(f"{shown(target)} is no share; give a number above 0, at most 1", "target")
-    deadline = Deadline.of(time_limit)
+    deadline, bracket = Deadline.of(time_limit), inputs.flag(bracket, "bracket")
     if not (result.control_index >= 0).any():
         raise BadInput(
             "there is no controller of which anything could be proved: " + result.message
         )
-    return proved(loop_of(result), target, deadline, holds(result), progress)
+    return proved(loop_of(result), target, deadline, holds(result), progress, bracket)
 
 
 def loop_of(result: Result) -> Loop:
@@ -110,10 +112,9 @@ def _policy(files: Reading, result: Result) -> dict[str, NDArray[Any]]:
 
 def read(path: str | os.PathLike[str], result: Result, said: ProofKeys) -> dict[str, NDArray[Any]]:
     """Read the boxes of a proof."""
-    shapes = expected(said.boxes, result.partition.dimension)
-    memory.require(
-        2.0 * (BOX + 5 * result.partition.dimension) * said.boxes, "the boxes of the proof"
-    )
+    shapes = expected(said.boxes, result.partition.dimension, said.parts)
+    each = BOX + 5 * result.partition.dimension
+    memory.require(2.0 * (each * said.boxes + 8 * (said.parts or 0)), "the boxes of the proof")
 
     def boxes(files: Reading) -> dict[str, NDArray[Any]]:
         return arrays.unpacked(files.open(NAME, arrays.largest(shapes)), NAME, shapes)
@@ -126,7 +127,10 @@ def note(said: ProofKeys) -> str:
     return (
         f"proof of the true map: {100 * said.arrives:.4f} % of C arrives, {100 * said.lost:.4f} % "
         f"is lost, {100 * said.stays:.4f} % stays elsewhere ({said.boxes:,} boxes checked)"
-    )
+    ) + (
+        f"; no control law costs less than {said.optimum[0]:.6g} on average there ({said.parts:,} "
+        "parts checked)" if said.optimum is not None else ""
+    )  # fmt: skip
 
 
 def proof_findings(
@@ -151,10 +155,17 @@ def _differences(
         return ["the proof is of no controller: control_index lacks a cell of C"]
     found = read(path, result, said)
     loop = loop_of(result)
+    bound = None
     reasons = checking.faults(loop, found, guard)
+    if not reasons and said.parts is not None:
+        bound, reasons = checked(loop, found, guard)
     if reasons:
         return reasons
-    proof = Proof.of(found, loop, seconds=said.seconds, holds=holds(result), target=said.target)
+    proof = Proof.of(
+        found, loop, seconds=said.seconds, holds=holds(result), target=said.target, bound=bound
+    )
+    if said.nonnegative is True and proof.nonnegative is not True:
+        reasons.append("proof.nonnegative is stored as true, but it is not proved")
     if said.sha256 != proof.sha256:
         reasons.append("proof.sha256 is not that of the boxes")
     for name in (*SHARES, "holds"):

@@ -23,7 +23,8 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.successors.dropping import list_sha256
 from lmdsl.model.successors.staying import Staying
 from lmdsl.problem.problem import Problem
-from lmdsl.proof.record import TARGET, Proof, volumes
+from lmdsl.proof.optimum.averages import volumes
+from lmdsl.proof.record import TARGET, Proof
 from lmdsl.proof.search import LOST, STAYS, UNDECIDED
 from lmdsl.results.result import Result
 from lmdsl.results.summary import Proved

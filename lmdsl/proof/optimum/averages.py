@@ -1,0 +1,86 @@
+"""Averages by volume over boxes, and what a bound and a proof say together."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Floats, Indices
+from lmdsl.machine.kernels import kernel
+from lmdsl.proof.loop import Loop
+from lmdsl.proof.optimum.bracket import Optimum
+from lmdsl.proof.optimum.moves import Grid
+from lmdsl.proof.search import ARRIVES
+
+Arrays = dict[str, NDArray[Any]]
+
+
+class Bracket(NamedTuple):
+    """What is said of the least cost of any law; see :class:`lmdsl.proof.record.Proof`."""
+
+    optimum: tuple[float, float] | None = None
+    nonnegative: bool | None = None
+    bound: Optimum | None = None
+    maps: tuple[Floats, Floats] | None = None
+
+    @classmethod
+    def of(cls, arrays: Arrays, loop: Loop, bound: Optimum) -> "Bracket":
+        """Return what a bound says of the boxes of a proof."""
+        some = arrays["class"] == ARRIVES
+        boxes = {name: arrays[name][some] for name in ("cell", "split", "place", "cost")}
+        weight, below = volumes(boxes["split"]), means(bound, loop, boxes)
+        N = loop.partition.size
+        maps = tuple(_by_cell(boxes["cell"], x, weight, N) for x in (below, boxes["cost"]))
+        ends = (mean(below, weight), mean(boxes["cost"], weight)) if len(weight) else None
+        return cls(ends, bound.nonnegative, bound, (maps[0], maps[1]))
+
+
+def _by_cell(cell: Indices, x: Floats, weight: Floats, N: int) -> Floats:
+    with np.errstate(invalid="ignore"):
+        total = np.bincount(cell, weights=x * weight, minlength=N)
+        return np.asarray(total / np.bincount(cell, weights=weight, minlength=N))
+
+
+def volumes(split: NDArray[np.uint8]) -> Floats:
+    """Return the volumes of boxes, in cells."""
+    return np.asarray(2.0 ** -split.sum(axis=1, dtype=np.float64))
+
+
+def mean(x: Floats, weight: Floats) -> float:
+    """Return a weighted mean, correctly rounded; infinite where a number is."""
+    if not np.isfinite(x).all():
+        return float(np.where(np.isfinite(x), 0.0, x).sum())
+    return math.fsum(x * weight) / math.fsum(weight)
+
+
+def means(optimum: Optimum, loop: Loop, boxes: Arrays) -> Floats:
+    """Return the mean of a bound over each of some boxes: arrays of a proof, shape (B,)."""
+    grid = Grid.of(loop.partition, optimum.split.astype(np.int64))
+    index = np.stack(loop.partition.multi_index(boxes["cell"]), axis=-1)
+    found = np.zeros(len(index))
+    _means(optimum.bound, (grid.split, grid.stride), index, boxes["split"], boxes["place"], found)
+    return found
+
+
+@kernel
+def _means(bound, grid, index, split, place, found):  # type: ignore[no-untyped-def]
+    fine, stride = grid
+    d = len(fine)
+    for b in range(len(found)):
+        count, first = 1, np.int64(0)
+        for k in range(d):
+            s, p = np.int64(split[b, k]), np.int64(place[b, k])
+            less = fine[k] - s
+            at = p >> -less if less < 0 else p << less
+            first += ((index[b, k] << fine[k]) + at) * stride[k]
+            count *= np.int64(1) << max(less, 0)
+        total = 0.0
+        for j in range(count):
+            rest, at = np.int64(j), first
+            for k in range(d - 1, -1, -1):
+                less = max(fine[k] - np.int64(split[b, k]), 0)
+                at += (rest & ((np.int64(1) << less) - 1)) * stride[k]
+                rest >>= less
+            total += bound[at]
+        found[b] = total / count
