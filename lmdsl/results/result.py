@@ -269,13 +269,9 @@ class Result(Summary):
 
     @own_arithmetic
     def prove(
-        self,
-        target: float = 0.999,
-        time_limit: float | None = None,
-        *,
-        bracket: bool = False,
+        self, target: float = 0.999, time_limit: float | None = None, *, bracket: bool = False,
         progress: Progress | None = None,
-    ) -> Proof:
+    ) -> Proof:  # fmt: skip
         """Prove what becomes of C under the controller: of the true map, by volume.
 
         Parameters
@@ -285,8 +281,7 @@ class Result(Summary):
         time_limit
             Seconds after which what is proved so far is the answer.
         bracket
-            Whether to bound from below what any control law costs, too, for the average over what
-            arrives.
+            Whether to bound what any control law costs, too.
         progress
             Called with (stage, fraction done).
 

@@ -16,7 +16,7 @@ import lmdsl as lm
 from lmdsl.cli import main
 from lmdsl.machine.deadline import Deadline
 from lmdsl.proof.optimum import bracket, checking
-from lmdsl.proof.optimum.moves import Grid
+from lmdsl.proof.optimum.moves import Parts
 from lmdsl.results.directory.proved import loop_of
 
 
@@ -46,7 +46,7 @@ def at(bound, loop, x):
     """The bound at states, shape (n, d)."""
     partition = loop.partition
     t = (x - partition.low) / (partition.high - partition.low)
-    grid = Grid.of(partition, bound.split.astype(np.int64))
+    grid = Parts.of(partition, bound.split.astype(np.int64))
     index = np.minimum((t * grid.shape).astype(np.int64), grid.shape - 1)
     return bound.bound[(index * grid.stride).sum(axis=1)]
 
@@ -231,7 +231,7 @@ def spoiled(bound, change):
 def test_a_bound_that_is_a_little_too_good_is_refused(name):
     """Raised by 1e-6 anywhere: T W does not rise with it, but where a part meets itself."""
     bound, loop = bounded(CASES[name], rows=2**9)
-    grid = Grid.of(loop.partition, bound.split.astype(np.int64))
+    grid = Parts.of(loop.partition, bound.split.astype(np.int64))
     game = loop.game()
     rng, refused = np.random.default_rng(0), 0
     parts = np.flatnonzero(np.isfinite(bound.bound) & (bound.bound > 0))

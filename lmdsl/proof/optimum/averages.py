@@ -10,10 +10,8 @@ from lmdsl.common.types import Floats, Indices
 from lmdsl.machine.kernels import kernel
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.optimum.bracket import Optimum
-from lmdsl.proof.optimum.moves import Grid
+from lmdsl.proof.optimum.moves import Parts
 from lmdsl.proof.search import ARRIVES
-
-Arrays = dict[str, NDArray[Any]]
 
 
 class Bracket(NamedTuple):
@@ -25,7 +23,7 @@ class Bracket(NamedTuple):
     maps: tuple[Floats, Floats] | None = None
 
     @classmethod
-    def of(cls, arrays: Arrays, loop: Loop, bound: Optimum) -> "Bracket":
+    def of(cls, arrays: dict[str, NDArray[Any]], loop: Loop, bound: Optimum) -> "Bracket":
         """Return what a bound says of the boxes of a proof."""
         some = arrays["class"] == ARRIVES
         boxes = {name: arrays[name][some] for name in ("cell", "split", "place", "cost")}
@@ -54,9 +52,9 @@ def mean(x: Floats, weight: Floats) -> float:
     return math.fsum(x * weight) / math.fsum(weight)
 
 
-def means(optimum: Optimum, loop: Loop, boxes: Arrays) -> Floats:
+def means(optimum: Optimum, loop: Loop, boxes: dict[str, NDArray[Any]]) -> Floats:
     """Return the mean of a bound over each of some boxes: arrays of a proof, shape (B,)."""
-    grid = Grid.of(loop.partition, optimum.split.astype(np.int64))
+    grid = Parts.of(loop.partition, optimum.split.astype(np.int64))
     index = np.stack(loop.partition.multi_index(boxes["cell"]), axis=-1)
     found = np.zeros(len(index))
     _means(optimum.bound, (grid.split, grid.stride), index, boxes["split"], boxes["place"], found)

@@ -12,7 +12,7 @@ import numpy as np
 from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.machine import threads
 from lmdsl.machine.kernels import kernel
-from lmdsl.proof.optimum.moves import Game, Grid, Moves
+from lmdsl.proof.optimum.moves import Game, Moves, Parts
 
 SLACK = 2.0**-40  # by how much bounds are lowered, relative: see settling.py
 MOST_MET = 2**16  # parts above which a range counts as all parts
@@ -50,7 +50,7 @@ def rounding(parts: int) -> float:
     return (parts + 8) * 2.0**-52
 
 
-def prepared(game: Game, grid: Grid, moves: Moves, most: float, slack: float) -> Sweep:
+def prepared(game: Game, grid: Parts, moves: Moves, most: float, slack: float) -> Sweep:
     """Return what sweeps of a grid need."""
     cell = grid.cell(game.partition, np.arange(grid.size))
     free = ~np.isfinite(game.entry[cell]) & ~game.avoided[cell]

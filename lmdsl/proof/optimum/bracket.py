@@ -12,7 +12,7 @@ from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline, Stopped
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.optimum.bounding import SLACK, consistent, prepared, settle
-from lmdsl.proof.optimum.moves import DEEPEST, Game, Grid
+from lmdsl.proof.optimum.moves import DEEPEST, Game, Parts
 
 FEW = 2**22  # rows up to which cells are cut without a time limit
 GROWS = 1.5  # by how much more the time grows than the rows
@@ -46,7 +46,7 @@ def bound(
     """
     game, d = loop.game(slack), loop.partition.dimension
     split = np.zeros(d, dtype=np.int64)
-    grid = Grid.of(loop.partition, split)
+    grid = Parts.of(loop.partition, split)
     known = Optimum(split.astype(np.uint8), ends(game, grid), not game.negative)
     order = np.arange(grid.size)
     while True:
@@ -62,11 +62,11 @@ def bound(
             return known
         finer = grid.split.copy()
         finer[np.argsort(finer, kind="stable")[:growth]] += 1
-        grid = Grid.of(loop.partition, finer)
+        grid = Parts.of(loop.partition, finer)
         order = np.argsort(carried(loop, known, grid), kind="stable")
 
 
-def _room(game: Game, grid: Grid, taken: float, deadline: Deadline) -> int:
+def _room(game: Game, grid: Parts, taken: float, deadline: Deadline) -> int:
     """Return how many axes can be cut once more in the time and the memory that are left."""
     rows = grid.size * len(game.control) * len(game.weight)
     for axes in range(len(grid.split), 0, -1):
@@ -80,7 +80,7 @@ def _room(game: Game, grid: Grid, taken: float, deadline: Deadline) -> int:
 
 
 def _bounded(
-    game: Game, grid: Grid, start: tuple[Optimum, Indices], most: float, deadline: Deadline
+    game: Game, grid: Parts, start: tuple[Optimum, Indices], most: float, deadline: Deadline
 ) -> Floats | None:
     """Return a bound on the parts of a grid; None where the time or the memory was too short."""
 
@@ -105,7 +105,7 @@ def _bounded(
     return W if consistent(sweep, W, order) else None
 
 
-def ends(game: Game, grid: Grid) -> Floats:
+def ends(game: Game, grid: Parts) -> Floats:
     """Return what is known of parts by their cells: of A its entry, of Z infinity, else 0."""
     cell = grid.cell(game.partition, np.arange(grid.size))
     W = np.where(game.avoided, np.inf, 0.0)[cell]
@@ -113,8 +113,8 @@ def ends(game: Game, grid: Grid) -> Floats:
     return np.where(np.isfinite(entry), entry * (1.0 - SLACK), W)
 
 
-def carried(of: Loop | Game, known: Optimum, grid: Grid) -> Floats:
+def carried(of: Loop | Game, known: Optimum, grid: Parts) -> Floats:
     """Return a bound on finer parts."""
-    old = Grid.of(of.partition, known.split.astype(np.int64))
+    old = Parts.of(of.partition, known.split.astype(np.int64))
     index = grid.by_axis(np.arange(grid.size)) >> (grid.split - old.split)
     return np.asarray(known.bound[(index * old.stride).sum(axis=1)])

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Floats, Guard
 from lmdsl.model.grid.boxes import named
+from lmdsl.proof.checking import Arrays
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.optimum.bounding import prepared, violated
 from lmdsl.proof.optimum.bracket import Optimum
-from lmdsl.proof.optimum.moves import DEEPEST, Game, Grid
-
-Arrays = dict[str, NDArray[Any]]
+from lmdsl.proof.optimum.moves import DEEPEST, Game, Parts
 
 
 def checked(loop: Loop, arrays: Arrays, guard: Guard) -> tuple[Optimum | None, list[str]]:
@@ -26,7 +25,7 @@ def checked(loop: Loop, arrays: Arrays, guard: Guard) -> tuple[Optimum | None, l
     """
     split, W = arrays["optimum_split"], arrays["optimum"]
     small = bool((split <= DEEPEST).all())
-    grid = Grid.of(loop.partition, split.astype(np.int64)) if small else None
+    grid = Parts.of(loop.partition, split.astype(np.int64)) if small else None
     if grid is None or grid.size != len(W):
         return None, ["proof.npz: optimum_split does not fit the number of parts in optimum"]
     game = loop.game()

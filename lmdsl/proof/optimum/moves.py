@@ -47,7 +47,7 @@ class Moves(NamedTuple):
     seam: NDArray[np.int32]
 
 
-class Grid(NamedTuple):
+class Parts(NamedTuple):
     """Equal parts of cells: bisections, parts, and stride by axis, shape (d,); and their number."""
 
     split: Indices
@@ -56,7 +56,7 @@ class Grid(NamedTuple):
     size: int
 
     @classmethod
-    def of(cls, partition: Partition, split: Indices) -> "Grid":
+    def of(cls, partition: Partition, split: Indices) -> "Parts":
         """Return the grid of parts."""
         shape = partition.cells.astype(np.int64) << split
         stride = np.append(np.cumprod(shape[:0:-1])[::-1], 1).astype(np.int64)
@@ -114,7 +114,7 @@ class Game:
         """Return the bytes of a row, with what is held while rows are made."""
         return 8 * self.partition.dimension + 9
 
-    def moves(self, grid: Grid, guard: Guard) -> Moves:
+    def moves(self, grid: Parts, guard: Guard) -> Moves:
         """Return what every control may do on every part."""
         part = np.arange(grid.size)
         cell = grid.cell(self.partition, part)
