@@ -19,8 +19,9 @@ import uuid
 import warnings
 from collections.abc import Iterator
 from functools import cache
+from itertools import product
 from pathlib import Path
-from types import CodeType, FunctionType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -242,14 +243,19 @@ def _warn(why: str) -> None:
 
 
 def _source(function: FunctionType, seen: set[FunctionType]) -> Iterator[bytes]:
-    """Yield the bytecode of a function, the constants it names, and the same of those it calls."""
+    """Yield the bytecode of a function, the constants it names, and the same of those it calls.
+
+    Also of those that it takes from modules: ``module.name``.
+    """
     if function in seen:
         return
     seen.add(function)
     yield repr(function.__defaults__).encode()
     yield from _code(function.__code__)
-    for name in function.__code__.co_names:
-        value: Any = function.__globals__.get(name)
+    names, known = function.__code__.co_names, function.__globals__
+    modules = [vars(known[name]) for name in names if isinstance(known.get(name), ModuleType)]
+    for name, place in product(names, [known, *modules]):
+        value: Any = place.get(name)
         if hasattr(value, "py_func"):
             yield from _source(value.py_func, seen)
         elif isinstance(value, int | float | str | tuple | np.generic | np.ndarray):

@@ -161,6 +161,7 @@ def test_folders_in_order(tmp_path, monkeypatch):
     assert find() == own[:1]  # no home: never a folder named ~
 
 
+@pytest.mark.parametrize("named", ["", "called."])
 @pytest.mark.parametrize(
     ("change", "times"),
     [
@@ -171,7 +172,7 @@ def test_folders_in_order(tmp_path, monkeypatch):
     ],
 )
 def test_a_change_in_a_kernel_or_constant_of_another_file_is_noticed(
-    folder, said, monkeypatch, change, times
+    folder, said, monkeypatch, change, times, named
 ):
     source = folder / "source"
     source.mkdir()
@@ -183,8 +184,9 @@ def test_a_change_in_a_kernel_or_constant_of_another_file_is_noticed(
         '@kernel\ndef add(x):\n    """Add."""\n    return x + STEP\n'
     )
     caller = (
-        "from called import add\nfrom lmdsl.machine.kernels import kernel\n\n\n"
-        "@kernel\ndef twice(x):\n    return add(add(x))\n"
+        f"{'import called' if named else 'from called import add'}\n"
+        "from lmdsl.machine.kernels import kernel\n\n\n"
+        f"@kernel\ndef twice(x):\n    return {named}add({named}add(x))\n"
     )
 
     def run():
