@@ -289,21 +289,21 @@ def compile(  # noqa: A001
     if problem.local_controller is not None:  # refuse a wrong one before the work
         LocalController.of(problem, partition, declared.attractor, limit)
     hold = holding.held(problem, partition, declared, limit)
-    sets = holding.within(declared, problem, hold)
-    transitions = assemble(problem, partition, progress, deadline, sets)
+    sets, empty = holding.within(declared, problem, hold), holding.leaves_nothing(problem, hold)
+    make = holding.no_pairs if empty else assemble
+    transitions = make(problem, partition, progress, deadline, sets)
     successors = Successors.asked_for(problem, partition, transitions, deadline, progress)
     controls = control_vectors(problem)
     pairs, left = left_out(dropped, transitions, len(controls))
     found = stabilizable_set.of_problem(problem, transitions, deadline, successors, left)
     kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
-    cells = sets.free[found.inside]
-    policy = found.pair[found.inside]  # the search for C ends with Algorithm 1 on its pairs
+    cells, policy = sets.free[found.inside], found.pair[found.inside]  # by Algorithm 1
     column = policy if isinstance(kept, slice) else np.searchsorted(kept, policy)
     lp = StabilizationLP(
         problem=problem,
         partition=partition,
         controls=controls,
-        cell_status=stabilizable_set.statuses(transitions, found),
+        cell_status=stabilizable_set.statuses(transitions, found, empty),
         cells=cells,
         pair_pointer=pair_pointer,
         control=transitions.control[kept],

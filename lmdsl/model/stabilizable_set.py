@@ -156,11 +156,15 @@ def of_transitions(
     return of_problem(problem, transitions, deadline, successors)
 
 
-def statuses(transitions: Transitions, found: Stabilizable) -> Statuses:
-    """Return the status code of every cell (see :class:`CellStatus`), shape (N,)."""
+def statuses(transitions: Transitions, found: Stabilizable, empty: bool = False) -> Statuses:
+    """Return the status code of every cell (see :class:`CellStatus`), shape (N,).
+
+    Where A is ``empty`` it cannot be reached, whatever the pairs are.
+    """
     free = np.full(len(found.inside), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
     free[~found.reaches] = CellStatus.TRAPPED
-    free[_choices(transitions, found.admissible) == 0] = CellStatus.ESCAPES
+    if not empty:
+        free[_choices(transitions, found.admissible) == 0] = CellStatus.ESCAPES
     free[found.inside] = CellStatus.STABILIZED
     status = np.full(len(transitions.sets.number), CellStatus.AVOID, dtype=np.uint8)
     status[transitions.sets.free] = free

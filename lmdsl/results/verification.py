@@ -152,7 +152,7 @@ def verify(
     same = result.model_sha256 in (lp.digest, archive.identity(lp))
     if not same:
         notes.append("the recompiled model differs from the stored one; claims are judged on it")
-    if not np.array_equal(lp.cell_status, result.cell_status):
+    if not _same_cells(lp, result):
         reasons.append("cell_status differs from the recompiled model")
     if result.status == Status.NOT_STABILIZABLE:
         certificate = _judge_refusal(lp, result, reasons, judge)
@@ -201,6 +201,14 @@ def recompiled(
     if not (np.isfinite(cost) & (cost >= 0)).all():
         raise BadInput("the saved costs are inconsistent", "model.npz")
     return replace(lp, problem=problem, cost=cost)
+
+
+def _same_cells(lp: StabilizationLP, result: Result) -> bool:
+    """Return whether cells are what they were; where none holds, earlier ones had other causes."""
+    ours, theirs = lp.cell_status, result.cell_status
+    if result.cause == Cause.HOLD:
+        ours, theirs = (np.where(np.isin(x, LOST), CellStatus.TRAPPED, x) for x in (ours, theirs))
+    return np.array_equal(ours, theirs)
 
 
 def _judge_claims(

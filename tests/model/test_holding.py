@@ -359,3 +359,25 @@ def test_a_boost_converter_is_held_where_others_hold_it():
     partition = Partition.of(problem)
     index = held(problem, partition, CellSets.of(problem, partition))
     assert (index >= 0).sum() >= 593_089
+
+
+def test_where_no_cell_holds_nothing_else_is_compiled(monkeypatch, tmp_path):
+    from lmdsl.model import lp as compiling
+
+    problem = parse_problem(cart(half=0.2))
+    monkeypatch.setattr(compiling, "assemble", None)  # it would be called
+    lp = lm.compile(problem)
+    assert (lp.n, lp.K) == (0, 0)
+    assert set(lp.cell_status.tolist()) == {CellStatus.TRAPPED}
+    result = lm.solve(problem)
+    assert result.cause == "hold"
+    result.save(tmp_path / "none")
+    earlier = archive.load(tmp_path / "none").cell_status.copy()
+    earlier[:5] = CellStatus.ESCAPES  # as they were compiled before
+    replace(result, cell_status=earlier).save(tmp_path / "earlier")
+    assert lm.verify(tmp_path / "earlier").holds
+    earlier = np.where(earlier == CellStatus.ESCAPES, CellStatus.ATTRACTOR, earlier).astype(
+        np.uint8
+    )
+    replace(result, cell_status=earlier).save(tmp_path / "spoiled")
+    assert not lm.verify(tmp_path / "spoiled").holds

@@ -19,9 +19,10 @@ from lmdsl.common.types import Bools, Floats, Indices, Progress, Statuses
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.algorithm_1 import owner
-from lmdsl.model.assembly.transitions import Transitions, assemble
-from lmdsl.model.discretization import control_vectors
+from lmdsl.model.assembly.transitions import Transitions, assemble, shares_of
+from lmdsl.model.discretization import control_vectors, noise_nodes, sample_points
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.rows import Rows
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus, keeping
 from lmdsl.model.successors.survival import Successors
@@ -132,6 +133,24 @@ def stored(problem: Problem, status: Statuses, index: Controls) -> Controls | No
 def none_holds(index: Controls | None) -> bool:
     """Return whether cells that hold were asked for, and there is none."""
     return index is not None and not (index >= 0).any()
+
+
+def leaves_nothing(problem: Problem, index: Controls | None) -> bool:
+    """Return whether no cell holds, and so there is nothing to compile: A is empty, and so is C."""
+    local = problem.local_controller
+    whole = isinstance(local, HoldControl) and not local.partial
+    return whole and problem.discount is None and none_holds(index)
+
+
+def no_pairs(
+    problem: Problem, partition: Partition, progress: Progress | None, deadline: Deadline | None,
+    sets: CellSets,
+) -> Transitions:  # fmt: skip
+    """Return transitions without a pair."""
+    F, nothing = len(sets.free), np.zeros(0, dtype=np.int32)
+    shares = shares_of(problem, sample_points(problem), noise_nodes(problem))
+    rows = Rows(np.zeros(1, dtype=np.int64), nothing, nothing.astype(np.uint8), shares, F)
+    return Transitions(sets, np.zeros(F + 1, dtype=np.int64), nothing, rows, np.zeros(0))
 
 
 def note(problem: Problem, partition: Partition, index: Controls | None) -> str:

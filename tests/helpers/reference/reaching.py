@@ -61,6 +61,7 @@ def classify(model: ReferenceModel) -> None:
     C, surviving = surely_reaching(model, model.admissible)
     reach = can_reach(model, model.admissible)
     some_pair = {cell for cell, _ in model.admissible}
+    nothing_to_reach = not (model.attractor or "discount" in model.problem)
     for cell in range(model.N):
         if cell in model.attractor:
             status = ATTRACTOR
@@ -68,9 +69,9 @@ def classify(model: ReferenceModel) -> None:
             status = AVOID
         elif cell in C:
             status = STABILIZED
-        elif cell not in some_pair:
+        elif cell not in some_pair and not nothing_to_reach:
             status = ESCAPES
-        elif cell not in reach:
+        elif cell not in reach or nothing_to_reach:
             status = TRAPPED
         else:
             status = LEADS
