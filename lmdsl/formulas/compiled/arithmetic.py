@@ -20,20 +20,24 @@ def copy(t, a):  # type: ignore[no-untyped-def]
 
 @kernel
 def add(t, a, b):  # type: ignore[no-untyped-def]
-    """Fill in t = a + b; sums so small that a unit in the last place vanishes are exact."""
+    """Fill in t = a + b; with 0 it is exact, and so small that a unit in the last place vanishes."""
     for i in range(np.uint64(t.shape[1])):
         low, high = a[0, i] + b[0, i], a[1, i] + b[1, i]
-        low, high = low - abs(low) * UNIT, high + abs(high) * UNIT
+        p, q = low - abs(low) * UNIT, high + abs(high) * UNIT
+        exact = ((a[0, i] == 0.0) & (a[1, i] == 0.0)) | ((b[0, i] == 0.0) & (b[1, i] == 0.0))
+        low, high = low if exact else p, high if exact else q
         sound = high - low < np.inf
         t[0, i], t[1, i] = low if sound else -np.inf, high if sound else np.inf
 
 
 @kernel
 def subtract(t, a, b):  # type: ignore[no-untyped-def]
-    """Fill in t = a - b."""
+    """Fill in t = a - b; a - 0 is exact."""
     for i in range(np.uint64(t.shape[1])):
         low, high = a[0, i] - b[1, i], a[1, i] - b[0, i]
-        low, high = low - abs(low) * UNIT, high + abs(high) * UNIT
+        p, q = low - abs(low) * UNIT, high + abs(high) * UNIT
+        exact = (b[0, i] == 0.0) & (b[1, i] == 0.0)
+        low, high = low if exact else p, high if exact else q
         sound = high - low < np.inf
         t[0, i], t[1, i] = low if sound else -np.inf, high if sound else np.inf
 
@@ -48,7 +52,7 @@ def negative(t, a):  # type: ignore[no-untyped-def]
 
 @kernel
 def multiply(t, a, b):  # type: ignore[no-untyped-def]
-    """Fill in t = a b; not negative where neither factor is."""
+    """Fill in t = a b; 0 where a factor is, not negative where neither is."""
     for i in range(np.uint64(t.shape[1])):
         al, ah, bl, bh = a[0, i], a[1, i], b[0, i], b[1, i]
         p, q, r, s = al * bl, al * bh, ah * bl, ah * bh
@@ -57,6 +61,8 @@ def multiply(t, a, b):  # type: ignore[no-untyped-def]
         low, high = p if p < r else r, s if q < s else q
         low, high = low - (abs(low) * UNIT + LEAST), high + (abs(high) * UNIT + LEAST)
         low = 0.0 if (low < 0.0) & (al >= 0.0) & (bl >= 0.0) else low
+        zero = ((al == 0.0) & (ah == 0.0)) | ((bl == 0.0) & (bh == 0.0))
+        low, high = 0.0 if zero else low, 0.0 if zero else high
         sound = (ah - al) + (bh - bl) + (high - low) < np.inf
         t[0, i], t[1, i] = low if sound else -np.inf, high if sound else np.inf
 
@@ -68,7 +74,11 @@ def scale(t, a, k):  # type: ignore[no-untyped-def]
         p, q = k * a[0, i], k * a[1, i]
         low, high = p if p < q else q, q if p < q else p
         low, high = low - (abs(low) * UNIT + LEAST), high + (abs(high) * UNIT + LEAST)
-        low = 0.0 if (low < 0.0) & (p >= 0.0) & (q >= 0.0) else low
+        least, most = a[0, i], a[1, i]
+        positive = ((k >= 0.0) & (least >= 0.0)) | ((k <= 0.0) & (most <= 0.0))
+        low = 0.0 if (low < 0.0) & positive else low
+        zero = (k == 0.0) | ((least == 0.0) & (most == 0.0))
+        low, high = 0.0 if zero else low, 0.0 if zero else high
         sound = (a[1, i] - a[0, i]) + (high - low) < np.inf
         t[0, i], t[1, i] = low if sound else -np.inf, high if sound else np.inf
 
@@ -98,6 +108,9 @@ def divide(t, a, b):  # type: ignore[no-untyped-def]
         r, s = r if r < s else s, s if r < s else r
         low, high = p if p < r else r, s if q < s else q
         low, high = low - (abs(low) * UNIT + LEAST), high + (abs(high) * UNIT + LEAST)
+        low = 0.0 if (low < 0.0) & (al >= 0.0) & (x >= 0.0) else low
+        zero = (al == 0.0) & (ah == 0.0)
+        low, high = 0.0 if zero else low, 0.0 if zero else high
         sound = apart & ((ah - al) + (b[1, i] - b[0, i]) + (y - x) + (high - low) < np.inf)
         t[0, i], t[1, i] = low if sound else -np.inf, high if sound else np.inf
 

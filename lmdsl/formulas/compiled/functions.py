@@ -19,6 +19,13 @@ NAMES = (
 
 
 @kernel
+def _rooted(which):  # type: ignore[no-untyped-def]
+    """Return whether a function is 0 at 0, which is exact."""
+    return ((which == SIN) | (which == TAN) | (which == SQRT) | (which == ATAN) | (which == TANH)
+            | (which == SINH) | (which == ASIN))  # fmt: skip
+
+
+@kernel
 def _wave(which, t, a):  # type: ignore[no-untyped-def]
     for i in range(t.shape[1]):
         if not a[1, i] - a[0, i] < np.inf:
@@ -82,13 +89,17 @@ def apply(which, t, a):  # type: ignore[no-untyped-def]
     """Fill in t = function(a)."""
     if which <= TAN:
         _wave(which, t, a)
-        return
-    for i in range(t.shape[1]):
-        low, high = -np.inf, np.inf
-        if a[1, i] - a[0, i] < np.inf:
-            low, high = _found(which, a[0, i], a[1, i])
-        sound = high - low < np.inf
-        t[0, i], t[1, i] = low if sound else -np.inf, high if sound else np.inf
+    else:
+        for i in range(t.shape[1]):
+            low, high = -np.inf, np.inf
+            if a[1, i] - a[0, i] < np.inf:
+                low, high = _found(which, a[0, i], a[1, i])
+            sound = high - low < np.inf
+            t[0, i], t[1, i] = low if sound else -np.inf, high if sound else np.inf
+    if _rooted(which):
+        for i in range(t.shape[1]):
+            if (a[0, i] == 0.0) & (a[1, i] == 0.0):
+                t[0, i], t[1, i] = 0.0, 0.0
 
 
 @kernel

@@ -42,10 +42,12 @@ class Writer:
     ----------
     inputs
         Number of rows that are given; they are the first registers.
+    units
+        Whether products with 1 and -1 are exact; else they are rounded as others are.
     """
 
-    def __init__(self, inputs: int) -> None:
-        self.inputs = inputs
+    def __init__(self, inputs: int, units: bool = True) -> None:
+        self.inputs, self.units = inputs, units
         self._written: list[_Written] = []
         self._known: dict[_Written, Slot] = {}
 
@@ -78,16 +80,16 @@ class Writer:
         return Fixed(-a.high, -a.low) if isinstance(a, Fixed) else self.emit(machine.NEGATIVE, a)
 
     def multiply(self, a: Value, b: Value) -> Value:
-        """Return a b; products with 0, 1 and -1 are exact."""
+        """Return a b; products with 0 are exact."""
         if isinstance(b, Fixed):
             a, b = b, a
         if not isinstance(a, Fixed):
             return self.emit(machine.SQUARE, a) if a == b else self.emit(machine.MULTIPLY, a, b)
         if isinstance(b, Fixed):
             return _fixed(iv.multiply(_interval(a), _interval(b)))
-        if a == ONE:
+        if self.units and a == ONE:
             return b
-        if a == Fixed(-1.0, -1.0):
+        if self.units and a == Fixed(-1.0, -1.0):
             return self.negative(b)
         if a.low == a.high:
             return self.emit(machine.SCALE, b, number=a.low)

@@ -4,7 +4,7 @@ StepBoxes are given axis by axis, as intervals of shapes that broadcast against 
 depends on the angle and the controls only is enclosed once for all positions.
 
 The path of a substep is a cubic Hermite arc. A part of it lies in the hull of its four Bernstein
-points, which are the start and sums of multiples of the slopes and the way (:func:`_blossoms`).
+points, which are the start and sums of multiples of the slopes and the way (:func:`blossoms`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -79,6 +79,14 @@ class Encloser:
         self.directions = len(self.width) + len(self.varying)
         self.arc_parts = 1
 
+    def stretches(
+        self, boxes: StepBoxes, path: bool, guard: Guard | None = None
+    ) -> Iterator[Stretch]:
+        """Enclose the parts of the path, where it is judged, and last the images."""
+        if path:
+            yield from self.path(boxes, guard)
+        yield self.images(boxes, guard)
+
     def images(self, boxes: StepBoxes, guard: Guard | None = None) -> Stretch:
         """Enclose the images of all boxes."""
         around, centre, away = self._around(boxes)
@@ -103,7 +111,7 @@ class Encloser:
                     for xs, ats in zip(boxed, middle, strict=True)
                 )
                 fast = self._judged_often(parts)
-                for i, points in enumerate(_blossoms(self.arc_parts)):
+                for i, points in enumerate(blossoms(self.arc_parts)):
                     judged = fast | (i == self.arc_parts - 1)  # the end of an arc always is
                     ways = [_ways(points, each) for each in zip(*parts, strict=True)]
                     places = tuple(
@@ -192,7 +200,7 @@ def _ways(
     return found[0], reduce(iv.hull, found[1:])
 
 
-def _blossoms(parts: int) -> Iterator[list[tuple[float, float, float]]]:
+def blossoms(parts: int) -> Iterator[list[tuple[float, float, float]]]:
     """Yield the Bernstein points of equal parts of an arc: multiples of slope, slope, way.
 
     With Bernstein points 0, m/3, r - n/3 and r of the whole arc, those of [s, e] are its blossom

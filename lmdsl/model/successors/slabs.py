@@ -20,6 +20,7 @@ from lmdsl.model.discretization import control_vectors, offsets
 from lmdsl.model.grid.axis import AxisCells
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.successors.assumed import encloser_of
+from lmdsl.model.successors.compiled.stretches import CompiledEncloser
 from lmdsl.model.successors.domains import Domain, domains
 from lmdsl.model.successors.enclosing import MOST_PARTS, StepBoxes, Stretch
 from lmdsl.model.true_map import TrueMap
@@ -74,6 +75,7 @@ class Slabs:
         self.admitted: Program | None = problem.admitted()
         self.names = (*problem.states, *problem.controls)
         self.pieces = self._cut()
+        self.fast = CompiledEncloser.of(self.encloser, self.path)
 
     def _cut(self) -> tuple[int, ...]:
         """Find out on some pairs how far cells, and arcs, have to be cut."""
@@ -114,12 +116,11 @@ class Slabs:
 
         Each array has the axes of the block, 1 long where it does not depend on one.
         """
-        boxes = self._boxes(block)
-        if self.path:
-            for stretch in self.encloser.path(boxes, self.guard):
-                assert stretch.judged is not None
-                yield self._spans(block, stretch), self._everywhere(block, stretch.judged)
-        yield self._spans(block, self.encloser.images(boxes, self.guard)), None
+        fast = self.fast or self.encloser
+        for stretch in fast.stretches(self._boxes(block), self.path, self.guard):
+            judged = stretch.judged
+            seen = None if judged is None else self._everywhere(block, judged)
+            yield self._spans(block, stretch), seen
 
     def admits(self, block: Slab) -> Bools | None:
         """Return on which cells the condition of admissible pairs certainly holds; None: all."""

@@ -1,7 +1,8 @@
 """The step of a problem as tapes: what encloses its images, its paths and its cost on boxes.
 
 Registers that are given come first: the values of all components (states, then the integral of a
-cost rate), their slopes in the directions of the states, their errors, the controls, the noise.
+cost rate), their slopes in all directions (the states, and of the noise what varies), their errors,
+the controls, the noise.
 """
 
 from collections.abc import Sequence
@@ -30,7 +31,7 @@ class Tapes(NamedTuple):
     box, centre
         The tapes.
     out
-        Registers of ``box``, shape (outputs, 2 + d): value, error, slopes (-1: no slope).
+        Registers of ``box``, shape (outputs, 2 + directions): value, error, slopes (-1: no slope).
     middle
         Registers of ``centre``, shape (outputs,).
     into
@@ -91,14 +92,14 @@ def step(problem: Problem) -> Step:
     names, states = (problem.controls, problem.noises), problem.states
     path = problem.judged == "path"
     if isinstance(advances, Program):
-        make = _Maker(states, names, len(states), seeded=True)
+        make = Maker(states, names, len(states), seeded=True)
         advance, end = make.program(advances), make.nothing()
     else:
-        make = _Maker(states, names, len(states) + advances.integrals, advances.substeps == 1)
+        make = Maker(states, names, len(states) + advances.integrals, advances.substeps == 1)
         advance, end = make.substep(advances, path), make.nothing()
         if path:
-            end = _Maker(states, names, make.components, seeded=False).knot(advances)
-    plain = _Maker(states, names, len(states), seeded=True)
+            end = Maker(states, names, make.components, seeded=False).knot(advances)
+    plain = Maker(states, names, len(states), seeded=True)
     return Step(
         advance, end, plain.program(stage), plain.program(problem.terminal()),
         getattr(advances, "substeps", 1), path,
@@ -115,39 +116,54 @@ def admitted(problem: Problem) -> Tapes | None:
     except BadInput:  # it is as long as a formula may be
         return None
     names = (problem.controls, problem.noises)
-    plain = _Maker(problem.states, names, len(problem.states), seeded=True)
+    plain = Maker(problem.states, names, len(problem.states), seeded=True)
     return plain.program(problem.program(formula))
 
 
-class _Maker:
+class Maker:
     """Makes tapes of the same registers.
 
-    ``seeded`` says that slopes are those at the start, 1 and 0; they are then no registers.
+    Parameters
+    ----------
+    states, names
+        Names of the states, and of controls and noise.
+    components
+        Number of components.
+    seeded
+        Whether slopes are those at the start, 1 and 0; they are then no registers.
+    varying
+        Names of noise in whose direction there are slopes.
+    units
+        As of a :class:`Writer`.
     """
 
     def __init__(
-        self, states: Sequence[str], names: tuple[Sequence[str], ...], components: int, seeded: bool
-    ) -> None:
-        self.states, self.names = states, (*names[0], *names[1])
-        self.components, self.seeded = components, seeded
+        self, states: Sequence[str], names: tuple[Sequence[str], ...], components: int,
+        seeded: bool, varying: Sequence[str] = (), units: bool = True,
+    ) -> None:  # fmt: skip
+        self.states, self.names, self.varying = states, (*names[0], *names[1]), varying
+        self.components, self.seeded, self.units = components, seeded, units
+        self.directions = len(states) + len(varying)
 
     def given(self, directions: int) -> tuple[Writer, dict[str, Traced], list[Traced]]:
         """Return a writer, the jets by name, and those of the components."""
-        d, m = len(self.states), self.components
-        first = m * (2 + d)
-        writer = Writer(first + len(self.names))
+        n, m = self.directions, self.components
+        first = m * (2 + n)
+        writer = Writer(first + len(self.names), self.units)
         parts = []
         for i in range(m):
             slope: list[Value | None] = [
-                (ONE if i == k else None) if self.seeded else writer.input(m + i * d + k)
+                (ONE if i == k else None) if self.seeded else writer.input(m + i * n + k)
                 for k in range(directions)
             ]
-            error = None if self.seeded else writer.input(m + m * d + i)
-            value = ZERO if self.seeded and i >= d else writer.input(i)
+            error = None if self.seeded else writer.input(m + m * n + i)
+            value = ZERO if self.seeded and i >= len(self.states) else writer.input(i)
             parts.append(Traced(writer, value, slope, error if directions else None))
         named = dict(zip(self.states, parts, strict=False))
         for j, name in enumerate(self.names):
-            named[name] = Traced(writer, writer.input(first + j), [None] * directions, None)
+            own = len(self.states) + self.varying.index(name) if name in self.varying else -1
+            slope = [ONE if k == own else None for k in range(directions)]
+            named[name] = Traced(writer, writer.input(first + j), slope, None)
         return writer, named, parts
 
     def nothing(self) -> Tapes:
@@ -158,12 +174,12 @@ class _Maker:
         """Return the tapes of formulas; without outputs where there are none."""
         if program is None:
             return self.nothing()
-        boxed, centred = (list(trace(program, self.given(n)[1])) for n in (len(self.states), 0))
+        boxed, centred = (list(trace(program, self.given(n)[1])) for n in (self.directions, 0))
         return self.made(boxed, centred)
 
     def substep(self, flow: RungeKutta, path: bool) -> Tapes:
         """Return the tapes of a substep of an equation."""
-        boxed, centred = (self._substep(flow, path, n) for n in (len(self.states), 0))
+        boxed, centred = (self._substep(flow, path, n) for n in (self.directions, 0))
         return self.made(boxed, centred, self.components)
 
     def _substep(self, flow: RungeKutta, path: bool, directions: int) -> list[Traced]:
@@ -193,11 +209,11 @@ class _Maker:
             thirds = [(flow.h / 3) * slopes[i] for i in range(d)]
             return [*(parts[i] - thirds[i] for i in range(d)), *thirds]
 
-        return self.made(found(len(self.states)), found(0))
+        return self.made(found(self.directions), found(0))
 
     def made(self, boxed: list[Traced], centred: list[Traced], into: int = 0) -> Tapes:
         """Return finished tapes; the first ``into`` outputs go where the components were."""
-        d, m = len(self.states), self.components
+        n, m = self.directions, self.components
         writer = boxed[0].writer if boxed else Writer(0)
         values: list[Value] = []
         goes: dict[int, Value] = {}
@@ -206,8 +222,8 @@ class _Maker:
             error = ZERO if jet.error is None else jet.error
             values += [jet.value, error, *slope]
             if i < into:
-                goes |= {i: jet.value, m + m * d + i: error}
-                goes |= {m + i * d + k: p for k, p in enumerate(slope)}
+                goes |= {i: jet.value, m + m * n + i: error}
+                goes |= {m + i * n + k: p for k, p in enumerate(slope)}
         box, out = writer.finish(values, goes)
         slopes = [p for jet in boxed for p in (ZERO, ZERO, *jet.slope)]
         out = [-1 if p is None else register for p, register in zip(slopes, out, strict=True)]
@@ -215,6 +231,6 @@ class _Maker:
         goes = {i: jet.value for i, jet in enumerate(centred[:into])}
         centre, middle = other.finish([jet.value for jet in centred], goes)
         return Tapes(
-            box, centre, np.array(out, dtype=np.int64).reshape(-1, 2 + d),
+            box, centre, np.array(out, dtype=np.int64).reshape(-1, 2 + n),
             np.array(middle, dtype=np.int64), into,
         )  # fmt: skip
