@@ -20,7 +20,7 @@ def copy(t, a):  # type: ignore[no-untyped-def]
 
 @kernel
 def add(t, a, b):  # type: ignore[no-untyped-def]
-    """Fill in t = a + b; with 0 it is exact, and so small that a unit in the last place vanishes."""
+    """Fill in t = a + b; exact with 0, and where a unit in the last place vanishes."""
     for i in range(np.uint64(t.shape[1])):
         low, high = a[0, i] + b[0, i], a[1, i] + b[1, i]
         p, q = low - abs(low) * UNIT, high + abs(high) * UNIT

@@ -91,13 +91,13 @@ class Encloser:
         """Enclose the images of all boxes."""
         around, centre, away = self._around(boxes)
         jets = self.true_map.enclose(*around, guard), self.true_map.enclose(*centre, guard)
+        axes = max(np.ndim(x.low) for x in self._directed(boxes))
         with np.errstate(all="ignore"):
-            return Stretch(
-                tuple(
-                    enclosure(box, at, away)
-                    for box, at in zip(jets[0] or (), jets[1] or (), strict=True)
-                )
+            found = (
+                enclosure(box, at, away)
+                for box, at in zip(jets[0] or (), jets[1] or (), strict=True)
             )
+            return Stretch(tuple(Interval(*(_spread(x, axes) for x in each)) for each in found))
 
     def path(self, boxes: StepBoxes, guard: Guard | None = None) -> Iterator[Stretch]:
         """Enclose the parts of the path, in order; the end is not among them."""
@@ -179,6 +179,11 @@ class Encloser:
 
     def _directed(self, boxes: StepBoxes) -> list[Interval]:
         return [*boxes.states, *(boxes.noise[j] for j in self.varying)]
+
+
+def _spread(x: Floats, axes: int) -> Floats:
+    """Return an array of as many axes; a constant has none."""
+    return x.reshape(x.shape or (1,) * axes)
 
 
 def _ways(

@@ -29,6 +29,7 @@ from lmdsl.problem.problem import Problem
 # Number of boxes, each with its control, that are enclosed at a time: that stay in cache; and up to
 # the other number where these stand for many more.
 LANES, MOST_LANES, SHARED = 2**14, 2**19, 8
+MOST_DOUBLES = 2**23  # of stretches that are kept at a time
 PROBED = 2**10  # number of pairs on which it is found out how far to cut
 PIECES = 16  # most pieces of a cell
 TARGET = 0.03  # excess of an enclosure, in cells, up to which cells are not cut any further
@@ -227,6 +228,7 @@ def blocks(grid: Slabs) -> Iterator[tuple[Slab, int]]:
     """
     shape, M = grid.partition.shape, grid.controls.shape[1]
     limit = max(LANES, min(MOST_LANES, grid.partition.size * M // SHARED))
+    limit = min(limit, MOST_DOUBLES // grid.fast.size) if grid.fast else limit
     small = Slab(tuple((0, min(2, n)) for n in shape), (0, min(2, M)))
     depends = [[n > 1 for n in low.shape] for spans, _ in grid.stretches(small) for low, _ in spans]
 

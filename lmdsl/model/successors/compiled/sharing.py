@@ -1,4 +1,4 @@
-"""Which components of a map depend on the same states, controls and noise: a tape for each such set.
+"""Which components of a map depend on the same states, controls and noise: a tape for each set.
 
 Components that share all are worked out together. What depends on the angle and the controls only
 is so enclosed once for all positions, by a tape that knows nothing of these.
@@ -26,7 +26,7 @@ class Shared(NamedTuple):
     ----------
     advance
         Makes a substep. Its outputs are the components that are carried from one to the next, of a
-        map the own ones; where a path is judged then of all own ones h times the slope, and the way.
+        map the own ones; where a path is judged then of own ones h times the slope, and the way.
     last
         Of the last knot h times the slope; without outputs where no path is judged.
     place, side
@@ -94,7 +94,8 @@ def _dependencies(true_map: TrueMap) -> list[frozenset[str]]:
     states, map_ = true_map.problem.states, true_map.map
     assert isinstance(map_, Program | RungeKutta)
     program = map_ if isinstance(map_, Program) else map_.field
-    direct = [frozenset(program.part([slot]).variables) for slot in program.outputs]
+    some = states[:1]  # of what depends on nothing: a tape needs a row
+    direct = [frozenset(program.part([slot]).variables or some) for slot in program.outputs]
     if isinstance(map_, Program):
         return direct
     own = [names | {state} for state, names in zip(states, direct, strict=True)]
@@ -136,7 +137,7 @@ class _SharedMaker:
             boxed, centred = (self._substep(n, arc_parts) for n in (make.directions, 0))
             advance = make.made(boxed, centred, len(self.carried))
             if arc_parts:
-                last = self.end.made(*(self._slopes(n) for n in (make.directions, 0)))
+                last = self.end.made(self._slopes(make.directions), self._slopes(0))
             own = [self.carried.index(i) for i in self.own]
         else:
             assert isinstance(self.map, Program)

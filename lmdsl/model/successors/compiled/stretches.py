@@ -5,55 +5,23 @@ Bernstein points of the parts of its arcs. What is exact there, sums with 0 amon
 """
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Floats, Guard
-from lmdsl.formulas.compiled.ends import UNIT
-from lmdsl.formulas.compiled.machine import BLOCK, registers, run
+from lmdsl.common.types import Bools, Guard
+from lmdsl.formulas.compiled.machine import BLOCK
 from lmdsl.formulas.intervals import Interval
 from lmdsl.formulas.program import Program
-from lmdsl.machine.kernels import fixed, kernel
-from lmdsl.model.successors.compiled.enclosing import mean_values
+from lmdsl.machine.kernels import fixed
 from lmdsl.model.successors.compiled.sharing import Group, Shared, groups
-from lmdsl.model.successors.enclosing import SLACK, Encloser, StepBoxes, Stretch, blossoms
+from lmdsl.model.successors.compiled.substeps import Found, enclose_substeps, room_for
+from lmdsl.model.successors.enclosing import Encloser, StepBoxes, Stretch, blossoms
 from lmdsl.systems.runge_kutta import RungeKutta
 
+SMALLEST = 2.0**-900  # width of a cell
 WORK = 2**24  # operations on boxes between two looks at the clock
-START, FIRST, LAST, WAY, KNOT = range(5)  # of an arc: its start, slopes, and way; the next start
-
-
-class Room(NamedTuple):
-    """Registers of the tapes of a group, sides of boxes, and what is known of an arc."""
-
-    box: Floats
-    centre: Floats
-    last_box: Floats
-    last_centre: Floats
-    away: Floats
-    arc: Floats
-
-
-class Found(NamedTuple):
-    """What is found of the own components of a group.
-
-    Attributes
-    ----------
-    low, high
-        Ends of all parts of the path, in order, and of the image, shape (stretches, own, boxes).
-    rises, falls
-        Whether the first part never goes below, or above, its start, shape (1, own, boxes).
-    steep
-        Of every arc the steepest end, in cells, shape (arcs, boxes).
-    """
-
-    low: Floats
-    high: Floats
-    rises: Bools
-    falls: Bools
-    steep: Floats
 
 
 Enclosed = tuple[Group, Found, tuple[int, ...]]
@@ -73,9 +41,13 @@ class CompiledEncloser:
 
     @classmethod
     def of(cls, encloser: Encloser, path: bool) -> "CompiledEncloser | None":
-        """Return what encloses in place of another; None where the map is not made of formulas."""
+        """Return what encloses in place of another.
+
+        None where the map is not made of formulas, and where cells are so small that least widths
+        (ends.py) could be seen.
+        """
         made = isinstance(encloser.true_map.map, Program | RungeKutta)
-        return cls(encloser, path) if made else None
+        return cls(encloser, path) if made and encloser.width.min() > SMALLEST else None
 
     @property
     def size(self) -> int:
@@ -97,8 +69,9 @@ class CompiledEncloser:
             if s == count - 1:
                 yield Stretch(places)
                 return
-            turns = (_by_axis(each, name, s) if s == 0 else () for name in ("rises", "falls"))
-            yield Stretch(places, *turns, self._judged(each, s))
+            rises, falls = (_by_axis(each, name, 0) for name in ("rises", "falls"))
+            turns = (() if s else rises, () if s else falls)
+            yield Stretch(places, turns[0], turns[1], self._judged(each, s))
 
     def _judged(self, each: list[Enclosed], s: int) -> Bools:
         """Return whether a part certainly holds a place at which it is judged; see enclosing.py."""
@@ -131,13 +104,13 @@ class CompiledEncloser:
             np.zeros((arcs, count)),
         )  # fmt: skip
         width = fixed(self.width[group.components])
-        room, step = _room(shared, own), _step(shared)
+        room, step = room_for(shared, own), _step(shared)
         with np.errstate(all="ignore"):
             for at in range(0, count, step):
                 if guard is not None:
                     guard()
                 limits = (at, min(at + step, count))
-                _enclose(shared, fixed(given), room, self.points, width, limits, found)
+                enclose_substeps(shared, fixed(given), room, self.points, width, limits, found)
         return found, shape
 
 
@@ -150,156 +123,7 @@ def _by_axis(each: list[Enclosed], name: str, s: int) -> tuple[NDArray[Any], ...
     return tuple(rows[i] for i in sorted(rows))
 
 
-def _room(shared: Shared, own: int) -> Room:
-    return Room(
-        registers(shared.advance.box), registers(shared.advance.centre),
-        registers(shared.last.box), registers(shared.last.centre),
-        np.zeros((shared.sizes[1], 2, BLOCK)), np.zeros((5, own, 2, BLOCK)),
-    )  # fmt: skip
-
-
 def _step(shared: Shared) -> int:
     """Return how many boxes are enclosed between two looks at the clock."""
     effort = shared.sizes[2] * max(len(shared.advance.box.code), 1)
     return max(WORK // effort // BLOCK, 1) * BLOCK
-
-
-@kernel
-def _load(rows, shared, given, begin, count):  # type: ignore[no-untyped-def]
-    """Put boxes into registers; slopes and errors as they are at the start."""
-    q, n, substeps, _ = shared.sizes
-    for j in range(len(shared.place)):
-        row = rows[shared.place[j]]
-        for i in range(count):
-            row[0, i], row[1, i] = given[j, 0, begin + i], given[j, 1, begin + i]
-    if substeps > 1:
-        for j in range(q * (n + 1)):
-            x = 1.0 if (j < q * n) & (j % n == j // n) else 0.0
-            for i in range(BLOCK):
-                rows[q + j, 0, i] = rows[q + j, 1, i] = x
-
-
-@kernel
-def _centre(box, rows, side, away):  # type: ignore[no-untyped-def]
-    """Put centres in place of boxes along all directions, and fill in the sides about them."""
-    for k in range(len(side)):
-        source, target = box[side[k]], rows[side[k]]
-        for i in range(BLOCK):
-            low, high = source[0, i], source[1, i]
-            c = low / 2.0 + high / 2.0
-            c = low if c < low else high if c > high else c
-            target[0, i] = target[1, i] = c
-            x, y = low - c, high - c
-            x, y = x - abs(x) * UNIT, y + abs(y) * UNIT
-            away[k, 0, i], away[k, 1, i] = low if c == 0.0 else x, high if c == 0.0 else y
-
-
-@kernel
-def _read(target, tapes, boxed, centred, away, first, rows):  # type: ignore[no-untyped-def]
-    """Fill in what encloses outputs, some rows from ``first`` on."""
-    for j in range(len(target)):
-        k = rows[j] if len(rows) else first + j
-        mean_values(target[j], boxed, tapes.out[k], centred[tapes.middle[k]], away)
-
-
-@kernel
-def _part(c, arc, j, i):  # type: ignore[no-untyped-def]
-    """Return the ends of a part of an arc, and of the way from its start to its later points."""
-    first, last, way = arc[FIRST, j], arc[LAST, j], arc[WAY, j]
-    sizes = (max(abs(first[0, i]), abs(first[1, i])), max(abs(last[0, i]), abs(last[1, i])),
-             max(abs(way[0, i]), abs(way[1, i])))  # fmt: skip
-    slack = SLACK * (sizes[0] + sizes[1] + sizes[2])
-    least, most, low, high = 0.0, 0.0, 0.0, 0.0
-    for p in range(4):
-        a, b = 0.0, 0.0
-        for x in range(3):
-            row = first if x == 0 else last if x == 1 else way
-            if c[p, x] > 0.0:
-                a, b = a + c[p, x] * row[0, i], b + c[p, x] * row[1, i]
-            elif c[p, x] < 0.0:
-                a, b = a + c[p, x] * row[1, i], b + c[p, x] * row[0, i]
-        a, b = a - slack, b + slack
-        if p == 0:
-            least, most = a, b
-        elif p == 1:
-            low, high = a, b
-        else:
-            low, high = min(low, a), max(high, b)
-    least, most = min(least, low), max(most, high)
-    s, e = arc[START, j, 0, i], arc[START, j, 1, i]
-    x, y = s + least, e + most
-    x, y = x - abs(x) * UNIT, y + abs(y) * UNIT
-    if (least == 0.0) & (most == 0.0):
-        x, y = s, e
-    elif (s == 0.0) & (e == 0.0):
-        x, y = least, most
-    sound = y - x < np.inf
-    return x if sound else -np.inf, y if sound else np.inf, low, high
-
-
-@kernel
-def _arc(s, points, arc, width, limits, found):  # type: ignore[no-untyped-def]
-    """Note all that is known of the s-th arc."""
-    begin, end = limits
-    for j in range(len(width)):
-        for i in range(end - begin):
-            for k in range(FIRST, LAST + 1):
-                a, b = arc[k, j, 0, i], arc[k, j, 1, i]
-                least = 0.0 if (a <= 0.0) & (b >= 0.0) else min(abs(a), abs(b)) / width[j]
-                found.steep[s, begin + i] = max(found.steep[s, begin + i], least)
-        for p in range(len(points)):
-            at = s * len(points) + p
-            for i in range(end - begin):
-                x, y, low, high = _part(points[p], arc, j, i)
-                found.low[at, j, begin + i], found.high[at, j, begin + i] = x, y
-                if at == 0:
-                    found.rises[0, j, begin + i] = low >= 0.0
-                    found.falls[0, j, begin + i] = high <= 0.0
-
-
-@kernel
-def _pass(source, target, count):  # type: ignore[no-untyped-def]
-    """Copy the first registers."""
-    for j in range(count):
-        for i in range(BLOCK):
-            target[j, 0, i], target[j, 1, i] = source[j, 0, i], source[j, 1, i]
-
-
-@kernel
-def _enclose(shared, given, room, points, width, limits, found):  # type: ignore[no-untyped-def]
-    q, n, substeps, parts = shared.sizes
-    tapes, arc, own, path = shared.advance, room.arc, len(width), parts > 0
-    none = shared.own[:0]
-    for begin in range(limits[0], limits[1], BLOCK):
-        end = min(begin + BLOCK, limits[1])
-        _load(room.box, shared, given, begin, end - begin)
-        _load(room.centre, shared, given, begin, end - begin)
-        _centre(room.box, room.centre, shared.side, room.away)
-        if path:
-            for j in range(own):
-                _pass(room.box[shared.own[j] : shared.own[j] + 1], arc[KNOT, j : j + 1], 1)
-        for s in range(substeps):
-            run(tapes.box, room.box)
-            run(tapes.centre, room.centre)
-            if path:
-                _read(arc[LAST], tapes, room.box, room.centre, room.away, q, none)
-                if s > 0:
-                    _arc(s - 1, points, arc, width, (begin, end), found)
-                _pass(arc[KNOT], arc[START], own)
-                _pass(arc[LAST], arc[FIRST], own)
-                _read(arc[WAY], tapes, room.box, room.centre, room.away, q + own, none)
-            if path or s == substeps - 1:
-                _read(arc[KNOT], tapes, room.box, room.centre, room.away, 0, shared.own)
-        if path:
-            given_rows = q * (2 + n) + len(shared.place) - q
-            _pass(room.box, room.last_box, given_rows)
-            _pass(room.centre, room.last_centre, given_rows)
-            run(shared.last.box, room.last_box)
-            run(shared.last.centre, room.last_centre)
-            _read(arc[LAST], shared.last, room.last_box, room.last_centre, room.away, 0, none)
-            _arc(substeps - 1, points, arc, width, (begin, end), found)
-        last = len(found.low) - 1
-        for j in range(own):
-            for i in range(end - begin):
-                found.low[last, j, begin + i] = arc[KNOT, j, 0, i]
-                found.high[last, j, begin + i] = arc[KNOT, j, 1, i]
