@@ -16,7 +16,7 @@ from lmdsl.formulas.intervals import Interval
 from lmdsl.formulas.program import Program
 from lmdsl.machine.kernels import fixed
 from lmdsl.model.successors.compiled.sharing import Group, Shared, groups
-from lmdsl.model.successors.compiled.substeps import Found, enclose_substeps, room_for
+from lmdsl.model.successors.compiled.substeps import GroupStretches, enclose_substeps, room_for
 from lmdsl.model.successors.enclosing import Encloser, StepBoxes, Stretch, blossoms
 from lmdsl.systems.runge_kutta import RungeKutta
 
@@ -24,7 +24,7 @@ SMALLEST = 2.0**-900  # width of a cell
 WORK = 2**24  # operations on boxes between two looks at the clock
 
 
-Enclosed = tuple[Group, Found, tuple[int, ...]]
+EnclosedGroup = tuple[Group, GroupStretches, tuple[int, ...]]
 
 
 class CompiledEncloser:
@@ -73,7 +73,7 @@ class CompiledEncloser:
             turns = (() if s else rises, () if s else falls)
             yield Stretch(places, turns[0], turns[1], self._judged(each, s))
 
-    def _judged(self, each: list[Enclosed], s: int) -> Bools:
+    def _judged(self, each: list[EnclosedGroup], s: int) -> Bools:
         """Return whether a part certainly holds a place at which it is judged; see enclosing.py."""
         arc, part = divmod(s, self.parts)
         steep = np.zeros(())
@@ -83,7 +83,7 @@ class CompiledEncloser:
 
     def _enclosed(
         self, group: Group, boxes: StepBoxes, guard: Guard | None
-    ) -> tuple[Found, tuple[int, ...]]:
+    ) -> tuple[GroupStretches, tuple[int, ...]]:
         points = (Interval(u, u) for u in boxes.controls)
         every: list[Interval] = [*boxes.states, *points, *boxes.noise]
         shape = np.broadcast_shapes(
@@ -97,7 +97,7 @@ class CompiledEncloser:
                 end.reshape(shape)[...] = ends
         arcs = shared.sizes[2] if self.parts else 0
         turns = (min(arcs, 1), own, count)
-        found = Found(
+        found = GroupStretches(
             np.empty((arcs * self.parts + 1, own, count)),
             np.empty((arcs * self.parts + 1, own, count)),
             np.empty(turns, dtype=np.bool_), np.empty(turns, dtype=np.bool_),
@@ -114,7 +114,7 @@ class CompiledEncloser:
         return found, shape
 
 
-def _by_axis(each: list[Enclosed], name: str, s: int) -> tuple[NDArray[Any], ...]:
+def _by_axis(each: list[EnclosedGroup], name: str, s: int) -> tuple[NDArray[Any], ...]:
     """Return rows of what was found of a stretch in the order of the axes, shaped as boxes."""
     rows: dict[int, NDArray[Any]] = {}
     for group, found, shape in each:

@@ -18,7 +18,7 @@ from lmdsl.model.successors.enclosing import SLACK
 START, FIRST, LAST, WAY, KNOT = range(5)  # of an arc: its start, slopes, and way; the next start
 
 
-class Room(NamedTuple):
+class GroupRoom(NamedTuple):
     """Registers of the tapes of a group, sides of boxes, and what is known of an arc."""
 
     box: Floats
@@ -29,7 +29,7 @@ class Room(NamedTuple):
     arc: Floats
 
 
-class Found(NamedTuple):
+class GroupStretches(NamedTuple):
     """What is found of the own components of a group.
 
     Attributes
@@ -49,9 +49,9 @@ class Found(NamedTuple):
     steep: Floats
 
 
-def room_for(shared: Shared, own: int) -> Room:
+def room_for(shared: Shared, own: int) -> GroupRoom:
     """Return room for a group of so many components; threads need their own."""
-    return Room(
+    return GroupRoom(
         registers(shared.advance.box), registers(shared.advance.centre),
         registers(shared.last.box), registers(shared.last.centre),
         np.zeros((shared.sizes[1], 2, BLOCK)), np.zeros((5, own, 2, BLOCK)),
