@@ -5,7 +5,7 @@ is cut into boxes until the enclosed image of each meets attractor cells only. T
 proved of the map as computed, with its rounding, and so of what a simulation can do.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -118,6 +118,12 @@ class _Loop:
         self.parts = noise_parts(problem)
         self.guard = partial(deadline.raise_if_over, DOING)
 
+    @property
+    def per_box(self) -> float:
+        """Operations that a box takes."""
+        parts, d = len(self.parts[0]), self.partition.dimension
+        return float(self.true_map.map.effort) * parts * (1 + d)
+
 
 def _sampled(loop: _Loop, cells: Indices, count: int) -> tuple[int, int]:
     """Return how many states were tried in time, and how many of them stay."""
@@ -158,23 +164,42 @@ def _proved(loop: _Loop, cells: Indices) -> int | None:
     """
     if loop.true_map.map.enclose is None:
         return None
-    per_box = float(loop.true_map.map.effort) * len(loop.parts[0]) * (1 + loop.partition.dimension)
-    proved, work = 0, WORK
+    proved, work, per_box = 0, WORK, loop.per_box
     for start in range(0, len(cells), CHUNK):
         some = cells[start : start + CHUNK]
         try:
             kept, spent = _kept(loop, some, work / per_box)
         except TimeLimitReached:
             break
-        proved += kept
+        proved += int(kept.sum())
         work -= spent * per_box
         if work <= 0:
             break
     return proved
 
 
-def _kept(loop: _Loop, cells: Indices, limit: float) -> tuple[int, float]:
-    """Return how many of some cells are proved, and the work in boxes.
+def keeping(problem: Problem, local: LocalController) -> Bools:
+    """Return attractor cells that a law is proved to keep for ever, shape (N,).
+
+    That is the greatest set in which all that a whole cell is mapped to lies, as far as some work
+    shows; found from above: of a set, the cells that are not mapped into it are left out.
+    """
+    inside, work = local.attractor.copy(), WORK
+    while inside.any() and work > 0:
+        loop, kept = _Loop(problem, replace(local, attractor=inside), Deadline()), inside.copy()
+        cells = np.flatnonzero(inside)
+        for start in range(0, len(cells), CHUNK):
+            some = cells[start : start + CHUNK]
+            found, spent = _kept(loop, some, max(work, 0.0) / loop.per_box)
+            kept[some], work = found, work - spent * loop.per_box
+        if kept.sum() == inside.sum():
+            return inside
+        inside = kept
+    return np.zeros_like(inside)
+
+
+def _kept(loop: _Loop, cells: Indices, limit: float) -> tuple[Bools, float]:
+    """Return which of some cells are proved, and the work in boxes.
 
     A box whose image is not enclosed in A is halved along its longest side (in cell widths),
     unless its centre is mapped outside: then its cell is lost.
@@ -203,7 +228,7 @@ def _kept(loop: _Loop, cells: Indices, limit: float) -> tuple[int, float]:
         low, high = np.concatenate([low, upper]), np.concatenate([lower, high])
         owner = np.concatenate([owner, owner])
     lost[owner] = True
-    return int((~lost).sum()), work
+    return ~lost, work
 
 
 def _images(

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Guard, Indices
+from lmdsl.common.types import Bools, Guard, Indices
 from lmdsl.machine import memory
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.boxes import named
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof.cover import Cover, node_bytes
+from lmdsl.proof.images.entering import entered
 from lmdsl.proof.images.pieces import DEEPEST
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.prover import Prover
@@ -45,8 +46,11 @@ FAULTS = {
 DOES = {ARRIVES: "arrive", LOST: "be lost", STAYS: "stay"}
 
 
-def faults(loop: Loop, arrays: Arrays, guard: Guard) -> list[str]:
-    """Return what does not hold of the boxes of a proof, one sentence each; at most a few."""
+def faults(loop: Loop, arrays: Arrays, guard: Guard, entry: Bools | None = None) -> list[str]:
+    """Return what does not hold of the boxes of a proof, one sentence each; at most a few.
+
+    In ``entry``, shape (N,), the attractor cells are marked that what arrives can enter.
+    """
     partition, count = loop.partition, len(arrays["cell"])
     images = loop.images()
     each = node_bytes(partition.dimension, len(images.noise[0]))
@@ -72,6 +76,8 @@ def faults(loop: Loop, arrays: Arrays, guard: Guard) -> list[str]:
     for start in range(0, count, SOME):
         guard()
         prover.enclose(place[start : start + SOME])
+    if entry is not None:
+        entry |= entered(cover, place[arrays["class"] == ARRIVES], loop.attractor)
     return _judged(prover, arrays, place, guard)
 
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Indices, Statuses
+from lmdsl.common.types import Bools, Floats, Indices, Statuses
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.successors.compiled import enclosing
@@ -41,6 +41,11 @@ class Loop(NamedTuple):
     def cells(self) -> int:
         """Number of cells of C."""
         return int((self.status == CellStatus.STABILIZED).sum())
+
+    @property
+    def attractor(self) -> Bools:
+        """The attractor cells, shape (N,)."""
+        return np.asarray(self.status == CellStatus.ATTRACTOR)
 
     @property
     def to_stay(self) -> bool:

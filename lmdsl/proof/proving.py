@@ -1,16 +1,18 @@
 """From a problem and a controller to a proof: what arrives, is lost, or stays, box by box."""
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, Progress
+from lmdsl.common.types import Bools, Floats, Progress
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import settling
 from lmdsl.proof.cover import Cover, node_bytes
+from lmdsl.proof.images.entering import entered
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.optimum.bracket import bound as best
 from lmdsl.proof.prover import Prover
@@ -29,13 +31,17 @@ BRACKET = 0.4  # part of a time limit that is kept for a lower bound of what any
 DECIDING = 0.7  # part of a time limit after which no more is decided, and bounds are tightened
 
 
+Holds = Callable[[Bools], bool | None]  # whether what enters these attractor cells stays in A
+
+
 def prove(
-    loop: Loop, target: float, deadline: Deadline, holds: bool | None, progress: Progress | None,
+    loop: Loop, target: float, deadline: Deadline, holds: Holds, progress: Progress | None,
     bracket: bool = False,
 ) -> Proof:  # fmt: skip
     """Prove what becomes of the volume of C, until the target is reached or nothing helps.
 
-    For a ``bracket``, bound from below what any law costs there, too.
+    For a ``bracket``, bound from below what any law costs there, too. ``holds`` is asked of the
+    attractor cells that what arrives can enter.
     """
     began = time.monotonic()
     images, partition = loop.images(SLACK), loop.partition
@@ -57,10 +63,14 @@ def prove(
     few = max(GROWN * len(prover.cover.leaves()), FEW)
     tighten(prover, lambda boxes: left is None and boxes > few, deadline, progress)
     arrays = boxes(prover)
+    leaves = prover.cover.leaves()
+    leaves = leaves[(prover.cover.tree.images[leaves] > 0)]
+    arriving = leaves[prover.cover.tree.state[leaves] == ARRIVES]
+    kept = holds(entered(prover.cover, arriving, loop.attractor))
     del prover
     bound = best(loop, _most(arrays), whole, progress, SLACK) if bracket else None
     seconds = time.monotonic() - began
-    return Proof.of(arrays, loop, seconds=seconds, holds=holds, target=target, bound=bound)
+    return Proof.of(arrays, loop, seconds=seconds, holds=kept, target=target, bound=bound)
 
 
 def _most(arrays: dict[str, NDArray[Any]]) -> float:

@@ -60,8 +60,8 @@ class Proof(Frozen):
     seconds
         Time it took.
     holds
-        Whether what is in A stays in A: True where it is proved, False where a run left it, None
-        where neither is known.
+        Whether what arrives stays in A: True where it is proved of all attractor cells that it can
+        enter, False where a run left A, None where neither is known.
     target
         The share asked for.
     witnesses
@@ -212,7 +212,7 @@ class Proof(Frozen):
             if (found := self.witnesses[name]) is not None
         ]
         held = {True: "proved", False: "refuted by a run", None: "not proved"}[self.holds]
-        lines.append(f"  that what is in A stays there is {held}")
+        lines.append(f"  that what arrives stays in A is {held}")
         lines.append(f"  {self.boxes:,} boxes, {self.seconds:.1f} s; target {self.target:.6g} is "
                      f"{'reached' if self.reached else 'not reached'}")  # fmt: skip
         return "\n".join(lines)

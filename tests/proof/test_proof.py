@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from problems import doubling, made, steps
@@ -232,6 +234,30 @@ def test_a_controller_inside_the_attractor_that_is_proved_to_hold():
     data["system"]["next"]["x"] = "where(x < 0.25, x + 0.2, 0.5*x)"
     _, proof = proved(data, target=0.5)
     assert proof.holds is False
+
+
+@pytest.mark.parametrize("local", [{"kind": "constant", "control": {}},
+                                   {"kind": "hold", "partial": True}])  # fmt: skip
+def test_what_arrives_stays_if_what_it_can_enter_holds(local, tmp_path):
+    """A = [0, 1/2]: what is above 3/8 leaves it; below it is halved. Who enters decides."""
+    data = line("where(x > 0.499, SHARE*x, where(x > 0.375, x + 0.3, 0.5*x))", cells=16)
+    data |= {"attractor": {"boxes": [{"x": [0, 0.5]}]}, "local_controller": local}
+    refuted = None if local["kind"] == "hold" else False  # states that do not hold are not tried
+    for share, holds in (("0.25", True), ("0.45", refuted)):
+        text = data["system"]["next"]["x"].replace("SHARE", share)
+        problem = made({**data, "system": {"kind": "map", "next": {"x": text}}})
+        result = lm.solve(problem)
+        assert 0 < result.local_controller.proved < 8
+        proof = result.prove(0.5)
+        assert proof.arrives == 1
+        assert proof.holds is holds
+        result.save(tmp_path / share)
+        assert lm.verify(tmp_path / share).holds
+    certificate = tmp_path / "0.45" / "certificate.json"
+    said = json.loads(certificate.read_text())
+    said["proof"]["holds"] = True
+    certificate.write_text(json.dumps(said))
+    assert not lm.verify(tmp_path / "0.45").holds
 
 
 def test_an_empty_answer_is_said_in_words():

@@ -1,6 +1,7 @@
 """The proof of a result, and what its directory says of it: proof.npz and certificate.json."""
 
 import os
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -8,10 +9,12 @@ from numpy.typing import NDArray
 
 from lmdsl.common import arrays, inputs
 from lmdsl.common.records import jsonable
-from lmdsl.common.types import Guard, Progress
+from lmdsl.common.types import Bools, Guard, Progress
+from lmdsl.control.invariance import keeping
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.local.controller import LocalController
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof import checking
 from lmdsl.proof.loop import Loop
@@ -39,7 +42,7 @@ def prove(
         raise BadInput(
             "there is no controller of which anything could be proved: " + result.message
         )
-    return proved(loop_of(result), target, deadline, holds(result), progress, bracket)
+    return proved(loop_of(result), target, deadline, partial(holds, result), progress, bracket)
 
 
 def loop_of(result: Result) -> Loop:
@@ -58,14 +61,31 @@ def _complete(result: Result) -> bool:
     return bool((result.control_index[result.cell_status == CellStatus.STABILIZED] >= 0).all())
 
 
-def holds(result: Result) -> bool | None:
-    """Return whether the attractor cells are kept: proved, refuted by a run, or neither."""
+def holds(result: Result, entered: Bools) -> bool | None:
+    """Return whether what enters some attractor cells stays: proved, refuted by a run, or neither.
+
+    It stays where these cells are among those that hold.
+    """
     local = result.local_controller
     if local is None:
         return None
     if local.proved == local.cells:
         return True
+    if local.proved and entered.any() and not (entered & ~_holding(result)).any():
+        return True
     return False if local.kept < local.samples else None
+
+
+def _holding(result: Result) -> Bools:
+    """Return attractor cells that are proved to be kept for ever, shape (N,)."""
+    local = result.local_controller
+    attractor = np.asarray(result.cell_status == CellStatus.ATTRACTOR)
+    law = LocalController.of(result.problem, result.partition, attractor)
+    if law is not None:
+        return keeping(result.problem, law)
+    if local is None or local.proved != local.holding:
+        return np.zeros_like(attractor)
+    return attractor & np.asarray(result.control_index >= 0)
 
 
 def add(path: str | os.PathLike[str], result: Result, proof: Proof) -> None:
@@ -156,13 +176,19 @@ def _differences(
     found = read(path, result, said)
     loop = loop_of(result)
     bound = None
-    reasons = checking.faults(loop, found, guard)
+    entry = np.zeros(result.partition.size, dtype=np.bool_)
+    reasons = checking.faults(loop, found, guard, entry)
     if not reasons and said.parts is not None:
         bound, reasons = checked(loop, found, guard)
     if reasons:
         return reasons
     proof = Proof.of(
-        found, loop, seconds=said.seconds, holds=holds(result), target=said.target, bound=bound
+        found,
+        loop,
+        seconds=said.seconds,
+        holds=holds(result, entry),
+        target=said.target,
+        bound=bound,
     )
     if said.nonnegative is True and proof.nonnegative is not True:
         reasons.append("proof.nonnegative is stored as true, but it is not proved")
