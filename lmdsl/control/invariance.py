@@ -178,7 +178,7 @@ def _proved(loop: _Loop, cells: Indices) -> int | None:
     return proved
 
 
-def keeping(problem: Problem, local: LocalController) -> Bools:
+def keeping(problem: Problem, local: LocalController | HoldingLaw) -> Bools:
     """Return attractor cells that a law is proved to keep for ever, shape (N,).
 
     That is the greatest set in which all that a whole cell is mapped to lies, as far as some work

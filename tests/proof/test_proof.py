@@ -10,6 +10,7 @@ from problems import doubling, made, steps
 from proved_points import box_at, exceptions
 
 import lmdsl as lm
+from lmdsl.results.directory.proved import add
 
 
 def line(formula, cells=4, **more):
@@ -252,6 +253,7 @@ def test_what_arrives_stays_if_what_it_can_enter_holds(local, tmp_path):
         assert proof.arrives == 1
         assert proof.holds is holds
         result.save(tmp_path / share)
+        add(tmp_path / share, lm.Result.load(tmp_path / share), proof)
         assert lm.verify(tmp_path / share).holds
     certificate = tmp_path / "0.45" / "certificate.json"
     said = json.loads(certificate.read_text())

@@ -14,7 +14,9 @@ from lmdsl.control.invariance import keeping
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.local import holding
 from lmdsl.model.local.controller import LocalController
+from lmdsl.model.local.holding import HoldingLaw
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof import checking
 from lmdsl.proof.loop import Loop
@@ -80,12 +82,16 @@ def _holding(result: Result) -> Bools:
     """Return attractor cells that are proved to be kept for ever, shape (N,)."""
     local = result.local_controller
     attractor = np.asarray(result.cell_status == CellStatus.ATTRACTOR)
-    law = LocalController.of(result.problem, result.partition, attractor)
-    if law is not None:
-        return keeping(result.problem, law)
-    if local is None or local.proved != local.holding:
-        return np.zeros_like(attractor)
-    return attractor & np.asarray(result.control_index >= 0)
+    problem, partition = result.problem, result.partition
+    law: LocalController | HoldingLaw | None = LocalController.of(problem, partition, attractor)
+    if law is None:
+        index = holding.stored(problem, result.cell_status, result.control_index)
+        if index is None:
+            return np.zeros_like(attractor)
+        if local is not None and local.proved == local.holding:
+            return np.asarray(index >= 0)
+        law = HoldingLaw.of(problem, partition, index)
+    return keeping(problem, law)
 
 
 def add(path: str | os.PathLike[str], result: Result, proof: Proof) -> None:
