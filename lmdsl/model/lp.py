@@ -32,7 +32,7 @@ from lmdsl.model.local.controller import LocalController
 from lmdsl.model.rows import RowArrays, Rows, digest_of
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.model.successors.dropping import left_out
+from lmdsl.model.successors.left_out.dropping import left_out
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem.problem import Problem
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Floats, Progress
+from lmdsl.common.types import Bools, Floats, Indices, Progress, Statuses
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import settling
@@ -32,16 +32,18 @@ DECIDING = 0.7  # part of a time limit after which no more is decided, and bound
 
 
 Holds = Callable[[Bools], bool | None]  # whether what enters these attractor cells stays in A
+# Told the cells of boxes, what is known of them, and their levels: whether that is enough.
+Ending = Callable[[Indices, Statuses, NDArray[np.int32]], bool]
 
 
 def prove(
     loop: Loop, target: float, deadline: Deadline, holds: Holds, progress: Progress | None,
-    bracket: bool = False,
+    bracket: bool = False, ending: Ending | None = None,
 ) -> Proof:  # fmt: skip
     """Prove what becomes of the volume of C, until the target is reached or nothing helps.
 
     For a ``bracket``, bound from below what any law costs there, too. ``holds`` is asked of the
-    attractor cells that what arrives can enter.
+    attractor cells that what arrives can enter. Where ``ending`` ends it, bounds are not tightened.
     """
     began = time.monotonic()
     images, partition = loop.images(SLACK), loop.partition
@@ -52,16 +54,7 @@ def prove(
         left *= 1.0 - BRACKET
         deadline = Deadline(left)
     prover = Prover(Cover(partition, loop.status), images, loop.factor, loop.entry(images))
-
-    def enough(shares: Floats) -> bool:
-        """Return whether the target is reached, or out of reach and little is left to know."""
-        reached = shares[STAYS if loop.to_stay else ARRIVES]
-        open_ = shares[UNDECIDED]
-        return bool(reached >= target or (reached + open_ < target and open_ < 1.0 - target))
-
-    prover.run(enough, Deadline(left and DECIDING * left), progress)
-    few = max(GROWN * len(prover.cover.leaves()), FEW)
-    tighten(prover, lambda boxes: left is None and boxes > few, deadline, progress)
+    _work(prover, loop, target, deadline, progress, ending)
     arrays = boxes(prover)
     leaves = prover.cover.leaves()
     leaves = leaves[(prover.cover.tree.images[leaves] > 0)]
@@ -71,6 +64,37 @@ def prove(
     bound = best(loop, _most(arrays), whole, progress, SLACK) if bracket else None
     seconds = time.monotonic() - began
     return Proof.of(arrays, loop, seconds=seconds, holds=kept, target=target, bound=bound)
+
+
+def _work(
+    prover: Prover, loop: Loop, target: float, deadline: Deadline, progress: Progress | None,
+    ending: Ending | None,
+) -> None:  # fmt: skip
+    """Decide what becomes of boxes, then tighten the bounds of the cost."""
+
+    def ended() -> bool:
+        return ending is not None and ending(*_decided(prover))
+
+    def enough(shares: Floats) -> bool:
+        """Return whether the target is reached, or out of reach and little is left to know."""
+        reached = shares[STAYS if loop.to_stay else ARRIVES]
+        open_ = shares[UNDECIDED]
+        if reached >= target or (reached + open_ < target and open_ < 1.0 - target):
+            return True
+        return bool(shares[LOST] + shares[STAYS] > 0) and ended()
+
+    left = deadline.left
+    prover.run(enough, Deadline(left and DECIDING * left), progress)
+    few = max(GROWN * len(prover.cover.leaves()), FEW)
+    if not ended():
+        tighten(prover, lambda boxes: left is None and boxes > few, deadline, progress)
+
+
+def _decided(prover: Prover) -> tuple[Indices, Statuses, NDArray[np.int32]]:
+    """Return the cells of leaves, what is known of them, and their levels."""
+    tree, leaves = prover.cover.tree, prover.cover.leaves()
+    leaves = leaves[tree.images[leaves] > 0]
+    return tree.cell[leaves].astype(np.int64), tree.state[leaves], tree.level[leaves]
 
 
 def _most(arrays: dict[str, NDArray[Any]]) -> float:

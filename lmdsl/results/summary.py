@@ -95,6 +95,9 @@ class Proved(Reported):
         The lower bound of the declared model, with no pair dropped.
     sha256
         Of the list of dropped pairs; empty where there is none.
+    without_loss
+        An upper bound of the share of the first C that any controller of these cells and controls
+        can keep without losing a run; None where it was not looked for.
     """
 
     target: float
@@ -103,6 +106,7 @@ class Proved(Reported):
     cells: int
     lower_bound: float | None
     sha256: str = ""
+    without_loss: float | None = None
 
     @property
     def reached(self) -> bool:

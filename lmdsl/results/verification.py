@@ -165,7 +165,7 @@ def verify(
     reasons += local_differences(lp, result, stored.certificate, deadline)
     reasons += proof_findings(path, result, stored.certificate.proof, in_time, notes)
     declared = partial(compile, result.problem, progress, deadline)
-    reasons += repaired.differences(result, stored.certificate.proof, declared, lp, judge)
+    reasons += repaired.differences(result, stored.certificate.proof, declared, lp, judge, deadline)
     found = Verification(
         not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
     )

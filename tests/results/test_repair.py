@@ -12,7 +12,7 @@ from saved_results import put, refused
 import lmdsl as lm
 from lmdsl.cli import main
 from lmdsl.results.directory import reading
-from lmdsl.results.directory.repairing import _Repair
+from lmdsl.results.directory.rounds import NONE, Rounds
 
 pytestmark = pytest.mark.long  # in other versions it would find nothing else
 
@@ -82,6 +82,35 @@ def test_what_no_control_repairs_is_missed_and_said():
     assert lower.proved.arrives == pytest.approx(2 / 3, abs=1e-3)
 
 
+def test_which_part_can_be_kept_without_a_loss_at_most_is_said_and_checked(tmp_path):
+    found = lm.solve(made(line(HOPELESS)), proved=0.999)
+    assert found.proved.without_loss == pytest.approx(2 / 3)
+    assert "66.6667 % of the first C" in found.message
+    found.save(tmp_path / "out")
+    assert lm.verify(tmp_path / "out").holds
+    path = tmp_path / "out" / "certificate.json"
+    stored = json.loads(path.read_text())
+    for without_loss, holds in ((0.6, False), (0.7, True), (None, True)):
+        stored["proved"]["without_loss"] = without_loss
+        path.write_bytes(reading.text(stored))
+        assert lm.verify(tmp_path / "out").holds == holds
+    del stored["proved"]["without_loss"]  # as it was before
+    path.write_bytes(reading.text(stored))
+    assert lm.verify(tmp_path / "out").holds
+
+
+def test_where_some_loss_is_unavoidable_the_control_that_loses_less_is_taken():
+    steep = "where(x > 0.9 + 0.05*u, 2, x - 0.25)"  # of the last cell 40 % are lost, or 20 %
+    found = lm.solve(made(line(steep)), proved=0.9)
+    assert found.proved.without_loss == pytest.approx(2 / 3)
+    assert found.dropped.tolist() == [[3, 0]]
+    assert found.control_index.tolist() == [-1, 0, 0, 1]
+    assert found.proof.lost == pytest.approx(0.2 / 3, abs=1e-3)
+    assert found.proved.reached
+    given_up = lm.solve(made(line(steep)), proved=0.6)
+    assert (given_up.proof.lost, given_up.stabilizable_cells) == (0, 2)
+
+
 def test_nothing_to_repair_drops_nothing(tmp_path):
     found = lm.solve(made(line("x - 0.25")), proved=0.999)
     assert found.dropped is None
@@ -94,7 +123,8 @@ def test_nothing_to_repair_drops_nothing(tmp_path):
 def test_the_law_of_sure_arrival_is_the_last_resort(monkeypatch):
     """u = 0 may leave the last cell for any other or stay: enclosed, it is admissible."""
     problem = made(line(KEEPS.replace("x - 0.25", "0.9*x - 0.21"), successors="enclosed"))
-    monkeypatch.setattr(_Repair, "culprits", lambda *_, **__: np.zeros((0, 2), dtype=np.int64))
+    monkeypatch.setattr(Rounds, "guilty", lambda *_: NONE)
+    monkeypatch.setattr(Rounds, "undecided", lambda *_: NONE)
     declared, found = lm.solve(problem), lm.solve(problem, proved=0.999)
     assert declared.prove().stays > 0
     assert found.proved.reached
@@ -194,6 +224,9 @@ def test_a_spoiled_list_is_refused(saved, changes):
         {"cells": 0},
         {"lower_bound": 2.1},
         {"sha256": ""},
+        {"without_loss": 0.9},
+        {"without_loss": -1.0},
+        {"without_loss": "all"},
         None,
     ],
 )

@@ -4,7 +4,7 @@ Beside them stand ``save`` and ``files``, which hold the files of a save togethe
 """
 
 import math
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from typing import Annotated, Any, Literal, Self, TypeVar, get_type_hints
 
 from pydantic import BeforeValidator, ConfigDict, Field, create_model
@@ -44,9 +44,12 @@ class _Keys(Declared):
 
 
 def _record(kind: type[Any]) -> BeforeValidator:
-    """Read a dataclass of ours from an object with just its keys."""
+    """Read a dataclass of ours from an object with just its keys; later ones have a default."""
     hints: dict[str, Any] = get_type_hints(kind)
-    keys: Any = {field.name: (hints[field.name], ...) for field in fields(kind)}
+    keys: Any = {
+        field.name: (hints[field.name], ... if field.default is MISSING else field.default)
+        for field in fields(kind)
+    }
     model = create_model(kind.__name__, __base__=_Keys, **keys)
 
     def read(value: Any) -> Any:

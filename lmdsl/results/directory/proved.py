@@ -21,6 +21,7 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof import checking
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.optimum.checking import checked
+from lmdsl.proof.proving import Ending
 from lmdsl.proof.proving import prove as proved
 from lmdsl.proof.record import BOX, Proof, expected
 from lmdsl.results.directory import reading, repaired, writing
@@ -34,9 +35,12 @@ SHARES = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes", "op
 
 def prove(
     result: Result, target: float, time_limit: float | None, progress: Progress | None = None,
-    bracket: bool = False,
+    bracket: bool = False, ending: Ending | None = None,
 ) -> Proof:  # fmt: skip
-    """Prove what becomes of C under the controller of a result; see :meth:`Result.prove`."""
+    """Prove what becomes of C under the controller of a result; see :meth:`Result.prove`.
+
+    It ends early where ``ending`` says so (proving.py).
+    """
     if not (inputs.is_number(target) and 0 < target <= 1):
         raise BadInput(f"{shown(target)} is no share; give a number above 0, at most 1", "target")
     deadline, bracket = Deadline.of(time_limit), inputs.flag(bracket, "bracket")
@@ -44,7 +48,8 @@ def prove(
         raise BadInput(
             "there is no controller of which anything could be proved: " + result.message
         )
-    return proved(loop_of(result), target, deadline, partial(holds, result), progress, bracket)
+    held = partial(holds, result)
+    return proved(loop_of(result), target, deadline, held, progress, bracket, ending)
 
 
 def loop_of(result: Result) -> Loop:

@@ -11,8 +11,10 @@ from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.common import arrays
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
+from lmdsl.machine.deadline import Deadline
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.successors.dropping import list_sha256
+from lmdsl.model.successors.left_out.dropping import list_sha256
+from lmdsl.model.successors.left_out.lossless import Lossless
 from lmdsl.proof.record import Proof
 from lmdsl.results.directory.certificate_file import ProofKeys
 from lmdsl.results.directory.reading import Reading
@@ -79,6 +81,7 @@ def differences(
     declared: Callable[[], StabilizationLP],
     lp: StabilizationLP,
     judge: Judge,
+    deadline: Deadline,
 ) -> list[str]:
     """Return where what is said of a repair is not so, one sentence each.
 
@@ -97,7 +100,7 @@ def differences(
     arrives = None if proof is None else share(proof.arrives, lp.n, first.n)
     if said.arrives != arrives:
         reasons.append(f"proved.arrives is stored as {said.arrives!r}, but is {arrives!r}")
-    return reasons + _lower(result, said, first, judge)
+    return reasons + _lower(result, said, first, judge) + _without_loss(said, first, deadline)
 
 
 def _lower(result: Result, said: Proved, first: StabilizationLP, judge: Judge) -> list[str]:
@@ -108,3 +111,15 @@ def _lower(result: Result, said: Proved, first: StabilizationLP, judge: Judge) -
     if said.lower_bound is None or said.lower_bound <= lower + ROUNDING * abs(lower):
         return []
     return [f"proved.lower_bound is stored as {said.lower_bound!r}, but {lower!r} is proved"]
+
+
+def _without_loss(said: Proved, first: StabilizationLP, deadline: Deadline) -> list[str]:
+    """Check how much of the first C can be kept without a loss at most."""
+    if said.without_loss is None or said.without_loss >= 1.0:
+        return []
+    found = Lossless.of(first, deadline)
+    deadline.raise_if_over("looking for what can be kept")
+    most = 1.0 if found is None else found.share
+    if said.without_loss >= most:
+        return []
+    return [f"proved.without_loss is stored as {said.without_loss!r}, but {most!r} is proved"]

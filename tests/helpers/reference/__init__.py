@@ -17,6 +17,7 @@ from reference.grid import Axis as Axis
 from reference.grid import flat as flat
 from reference.grid import read_axes as read_axes
 from reference.grid import unflat as unflat
+from reference.lossless import lossless_cells as lossless_cells
 from reference.model import ReferenceModel as ReferenceModel
 from reference.policies import Arrays as Arrays
 from reference.reaching import classify as classify

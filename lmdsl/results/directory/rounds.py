@@ -1,0 +1,205 @@
+"""The rounds of a repair: solve without some pairs, prove, and drop those at fault.
+
+Pairs of which a state loses the run, whatever is done afterwards, are dropped beforehand: all of
+them where enough of C can be kept without, else those that lose more than others of their cell.
+A round proves what becomes of C under the controller. If after a moment there are pairs at which a
+proved loss begins or that keep runs elsewhere, they are dropped; else the proof goes on.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Bools, Floats, Indices, Progress, Statuses
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.successors.left_out.lossless import Lossless
+from lmdsl.proof.optimum.averages import volumes
+from lmdsl.proof.record import TARGET, Proof
+from lmdsl.proof.search import LOST, STAYS, UNDECIDED
+from lmdsl.results.directory.proved import prove
+from lmdsl.results.result import Result
+
+Pairs = NDArray[np.int64]  # rows (cell, control)
+Depths = NDArray[np.int32]
+Again = Callable[[Pairs], Result]  # solves without some pairs
+
+NONE: Pairs = np.zeros((0, 2), dtype=np.int64)
+STALE = 4  # rounds that bring nothing, after which the search ends
+# Most seconds, and part of the time that is left, before a proof ends where pairs are at fault.
+MOMENT, PART = 30.0, 0.2
+LAST = 0.85  # part of the time that is left which a proof may take
+WORST = 0.5  # share of the largest undecided volume of a cell that is as bad
+
+
+class Round(NamedTuple):
+    """A result, its proof, and what the proof says of the first C.
+
+    Attributes
+    ----------
+    result, proof, arrives
+        ``arrives`` is the share of the first C.
+    whole
+        Whether the proof went on after a moment.
+    """
+
+    result: Result
+    proof: Proof
+    arrives: float
+    whole: bool
+
+    def worth(self, target: float) -> tuple[bool, float, float]:
+        """Return what makes a round better than others: the target first, then that less is lost.
+
+        Below the target what arrives decides.
+        """
+        if self.arrives >= target:
+            return True, -self.proof.lost, self.arrives
+        return False, self.arrives, -self.proof.lost
+
+
+class Rounds:
+    """The search for a controller of which enough is proved.
+
+    Attributes
+    ----------
+    lp
+        The model of the first result.
+    lossless
+        What can be kept without a loss; None where that is not known.
+    why
+        Why the search ended.
+    """
+
+    def __init__(
+        self, first: Result, again: Again, target: float, deadline: Deadline,
+        progress: Progress | None,
+    ) -> None:  # fmt: skip
+        assert first.lp is not None
+        self.first, self.again, self.target = first, again, target
+        self.deadline, self.progress = deadline, progress
+        self.lp: StabilizationLP = first.lp
+        self.why = "no other control helps"
+        self.lossless = Lossless.of(self.lp, deadline, progress)
+
+    def best(self) -> Round:
+        """Return the best round."""
+        best: Round | None = None
+        for pairs, spared in self._starts():
+            found = self._from(pairs, spared)
+            if best is None or (found and found.worth(self.target) > best.worth(self.target)):
+                best = found
+            if best is not None and (best.arrives >= self.target or spared is not None):
+                break
+        return best or self._proved(self.first, None, whole=True)
+
+    def _starts(self) -> Iterator[tuple[Pairs, Bools | None]]:
+        """Yield pairs to drop beforehand, and in which cells losses are put up with, shape (N,)."""
+        known, pairs = self.lossless, NONE
+        if known is not None and known.share >= self.target:
+            pairs = known.losing()
+            yield pairs, None
+        if known is not None and (len(pairs) or known.share < self.target):
+            yield known.losing_most()
+        elif known is None:
+            yield NONE, None
+
+    def _from(self, pairs: Pairs, spared: Bools | None) -> Round | None:
+        """Return the best round of those that begin without some pairs."""
+        given = NONE if self.lp.dropped is None else self.lp.dropped
+        dropped, stale, best = np.concatenate([given, pairs]), 0, None
+        if len(pairs):
+            trial = self.solved(dropped, spared, self.target)
+        else:
+            trial = self._proved(self.first, spared)
+        while trial is not None:
+            better = best is None or trial.worth(self.target) > best.worth(self.target)
+            best, stale = (trial, 0) if better else (best, stale + 1)
+            pairs = self.guilty(trial, spared, stale >= 2)
+            if not len(pairs) and trial.arrives < self.target and self.deadline.left is None:
+                pairs = self.undecided(trial)
+            if not len(pairs) or stale >= STALE:
+                break
+            dropped = np.concatenate([dropped, pairs])
+            trial = self.solved(dropped, spared, self.target)
+        return best if best is None or best.whole else self._proved(best.result, None, whole=True)
+
+    def solved(self, dropped: Pairs, spared: Bools | None, least: float = 0.0) -> Round | None:
+        """Solve without some pairs, and prove; None where C is too small, or there is no time."""
+        if self.deadline():
+            self.why = "the time limit was reached"
+            return None
+        result = self.again(dropped)
+        if not result.verified or result.lp is None:
+            self.why = f"without more pairs the problem is {result.status}"
+            return None
+        if result.lp.n < least * self.lp.n:
+            self.why = f"without more pairs C has {result.lp.n} of {self.lp.n} cells"
+            return None
+        return self._proved(result, spared)
+
+    def _proved(self, result: Result, spared: Bools | None, whole: bool = False) -> Round:
+        """Prove what becomes of a result's C; the ``whole``, or until pairs are at fault."""
+        part = result.lp.n / self.lp.n if result.lp is not None else 1.0
+        left = self.deadline.left
+        moment = time.monotonic() + (MOMENT if left is None else min(MOMENT, PART * left))
+
+        def at_fault(cell: Indices, state: Statuses, level: Depths) -> bool:
+            """Return whether a moment has passed, and decided boxes put pairs at fault."""
+            if whole or time.monotonic() < moment:
+                return False
+            return len(_faulty(cell, state, level, spared)) > 0
+
+        wanted = min(1.0, max(self.target / part, TARGET))  # less would leave losses undecided
+        limit = None if left is None else LAST * left
+        proof = prove(result, wanted, limit, self.progress, ending=at_fault)
+        ended = at_fault(proof.cell, proof.kind, proof.level)
+        return Round(result, proof, proof.arrives * part, not ended)
+
+    def guilty(self, trial: Round, spared: Bools | None, alone: bool) -> Pairs:
+        """Return pairs of the controller at which a loss begins or that keep runs elsewhere.
+
+        Those of cells that have other controls, unless that did not help: those that stand
+        ``alone`` take their cells with them. Where no loss is put up with all of them.
+        """
+        lp, proof = trial.result.lp, trial.proof
+        assert lp is not None
+        cells = np.unique(_faulty(proof.cell, proof.kind, proof.level, spared))
+        able = cells[np.isin(cells, _several(lp))]
+        return _pairs(trial, able if len(able) and not alone else cells)
+
+    def undecided(self, trial: Round) -> Pairs:
+        """Return the most undecided pairs of the controller, of cells that have other controls."""
+        lp = trial.result.lp
+        assert lp is not None
+        several = _several(lp)
+        waits = volume(trial.proof, UNDECIDED, lp.partition.size)[several]
+        return _pairs(trial, several[(waits > 0) & (waits >= WORST * waits.max(initial=0.0))])
+
+
+def _faulty(cell: Indices, state: Statuses, level: Depths, spared: Bools | None) -> Indices:
+    """Return the cells of boxes at which a loss begins that is not put up with, or that stay."""
+    begins = (state == LOST) & (level == 1)
+    if spared is not None:
+        begins &= ~spared[cell]
+    return np.asarray(cell[begins | (state == STAYS)])
+
+
+def _several(lp: StabilizationLP) -> Indices:
+    """Return the cells of a model that have several controls."""
+    return np.asarray(lp.cells[np.diff(lp.pair_pointer) > 1])
+
+
+def _pairs(trial: Round, cells: Indices) -> Pairs:
+    """Return the pairs of the controller in some cells."""
+    return np.stack([cells, trial.result.control_index[cells].astype(np.int64)], axis=-1)
+
+
+def volume(proof: Proof, kind: int, cells: int) -> Floats:
+    """Return how much of every cell is of a kind, shape (N,), in cells."""
+    some = proof.kind == kind
+    found = np.bincount(proof.cell[some], volumes(proof.split[some]), minlength=cells)
+    return np.asarray(found, dtype=np.float64)
