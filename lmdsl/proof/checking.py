@@ -6,16 +6,15 @@ induction over levels the theorems hold then, whatever made the boxes.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Guard, Indices
 from lmdsl.machine import memory
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.boxes import named
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.proof.bounds.optimum.averages import Arrays
 from lmdsl.proof.cover import Cover, node_bytes
 from lmdsl.proof.images.entering import entered
 from lmdsl.proof.images.pieces import DEEPEST
@@ -34,7 +33,6 @@ from lmdsl.proof.search import (
 from lmdsl.proof.settling import stage_bounds, unite_all
 
 SOME = 2**16  # boxes checked between two looks at the clock
-Arrays = dict[str, NDArray[Any]]
 
 FAULTS = {
     1: "is said to {kind}, but its image may meet something else",

@@ -9,9 +9,9 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.successors.compiled import enclosing
 from lmdsl.problem.problem import Problem
+from lmdsl.proof.bounds.optimum.moves import Game
 from lmdsl.proof.images.pieces import pieces
 from lmdsl.proof.images.seen import BoxImages
-from lmdsl.proof.optimum.moves import Game
 
 
 class Loop(NamedTuple):

@@ -11,14 +11,17 @@ from lmdsl.common.types import Bools, Floats, Indices, Progress, Statuses
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import settling
+from lmdsl.proof.bounds.flights.following import Flights
+from lmdsl.proof.bounds.flights.refining import SLACK as RAISED
+from lmdsl.proof.bounds.flights.refining import refine
+from lmdsl.proof.bounds.optimum.bracket import bound as best
+from lmdsl.proof.bounds.tightening import tighten
 from lmdsl.proof.cover import Cover, node_bytes
 from lmdsl.proof.images.entering import entered
 from lmdsl.proof.loop import Loop
-from lmdsl.proof.optimum.bracket import bound as best
 from lmdsl.proof.prover import Prover
 from lmdsl.proof.record import Proof
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
-from lmdsl.proof.tightening import tighten
 
 # Images are widened by so much, in cells, when boxes are chosen, but not when they are checked:
 # other versions of elementary functions differ by less.
@@ -28,6 +31,7 @@ SLACK = 2.0**-36
 # or so many.
 GROWN, FEW = 4, 200_000
 BRACKET = 0.4  # part of a time limit that is kept for a lower bound of what any law costs
+BOXED = 0.3  # part of what is left then for boxes, where parts of cells can be followed after it
 DECIDING = 0.7  # part of a time limit after which no more is decided, and bounds are tightened
 
 
@@ -54,23 +58,28 @@ def prove(
         left *= 1.0 - BRACKET
         deadline = Deadline(left)
     prover = Prover(Cover(partition, loop.status), images, loop.factor, loop.entry(images))
-    _work(prover, loop, target, deadline, progress, ending)
+    flights = Flights(loop, SLACK, RAISED)
+    bounded = _work((prover, flights), loop, target, deadline, progress, ending)
     arrays = boxes(prover)
     leaves = prover.cover.leaves()
     leaves = leaves[(prover.cover.tree.images[leaves] > 0)]
     arriving = leaves[prover.cover.tree.state[leaves] == ARRIVES]
     kept = holds(entered(prover.cover, arriving, loop.attractor))
     del prover
+    above = refine(flights, arrays, deadline, progress) if bounded else None
     bound = best(loop, _most(arrays), whole, progress, SLACK) if bracket else None
     seconds = time.monotonic() - began
-    return Proof.of(arrays, loop, seconds=seconds, holds=kept, target=target, bound=bound)
+    return Proof.of(
+        arrays, loop, seconds=seconds, holds=kept, target=target, above=above, bound=bound
+    )
 
 
 def _work(
-    prover: Prover, loop: Loop, target: float, deadline: Deadline, progress: Progress | None,
-    ending: Ending | None,
-) -> None:  # fmt: skip
-    """Decide what becomes of boxes, then tighten the bounds of the cost."""
+    own: tuple[Prover, Flights], loop: Loop, target: float, deadline: Deadline,
+    progress: Progress | None, ending: Ending | None,
+) -> bool:  # fmt: skip
+    """Decide what becomes of boxes, then tighten the bounds of the cost; return whether it did."""
+    prover, flights = own
 
     def ended() -> bool:
         return ending is not None and ending(*_decided(prover))
@@ -86,8 +95,13 @@ def _work(
     left = deadline.left
     prover.run(enough, Deadline(left and DECIDING * left), progress)
     few = max(GROWN * len(prover.cover.leaves()), FEW)
-    if not ended():
-        tighten(prover, lambda boxes: left is None and boxes > few, deadline, progress)
+    if ended():
+        return False
+    some = deadline
+    if flights.able and deadline.left is not None:
+        some = Deadline(BOXED * deadline.left)
+    tighten(prover, lambda boxes: left is None and boxes > few, some, progress)
+    return True
 
 
 def _decided(prover: Prover) -> tuple[Indices, Statuses, NDArray[np.int32]]:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Floats
+from lmdsl.proof.bounds.flights.refining import Above
+from lmdsl.proof.bounds.optimum.averages import Bracket, mean, means, volumes
+from lmdsl.proof.bounds.optimum.bracket import Optimum
 from lmdsl.proof.loop import Loop
-from lmdsl.proof.optimum.averages import Bracket, mean, volumes
-from lmdsl.proof.optimum.bracket import Optimum
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
 
 _WITNESSES = {
@@ -25,21 +26,24 @@ ARRAYS: dict[str, tuple[bool, str]] = {  # by axis too, and the kind
     "cell": (False, "<i8"), "split": (True, "|u1"), "place": (True, "<u4"), "class": (False, "|u1"),
     "level": (False, "<i4"), "cost": (False, "<f8"), "lower": (False, "<f8"),
 }  # fmt: skip
-BOUND: dict[str, str] = {"optimum_split": "|u1", "optimum": "<f8"}  # of a bracket
+# Bounds on equal parts of cells: of runs that arrive, and of a bracket.
+ABOVE: dict[str, str] = {"above_split": "|u1", "above": "<f4"}
+BOUND: dict[str, str] = {"optimum_split": "|u1", "optimum": "<f8"}
 BOX = 40  # bytes of a box but for its axes
 
 
 def expected(
-    boxes: int, axes: int, parts: int | None = None
+    boxes: int, axes: int, followed: int | None = None, parts: int | None = None
 ) -> dict[str, tuple[tuple[int, ...], str]]:
     """Return the shapes and kinds of the arrays of so many boxes, and of the parts of a bound."""
     shapes: dict[str, tuple[tuple[int, ...], str]] = {
         name: ((boxes, axes) if by_axis else (boxes,), kind)
         for name, (by_axis, kind) in ARRAYS.items()
     }
-    if parts is not None:
-        sizes = (axes,), (parts,)
-        shapes |= {n: (size, k) for (n, k), size in zip(BOUND.items(), sizes, strict=True)}
+    for kinds, count in ((ABOVE, followed), (BOUND, parts)):
+        if count is not None:
+            sizes = (axes,), (count,)
+            shapes |= {n: (size, k) for (n, k), size in zip(kinds.items(), sizes, strict=True)}
     return shapes
 
 
@@ -76,6 +80,9 @@ class Proof(Frozen):
     cost_above, cost_below
         Bounds of the cost of a run from there (with noise ``cost_below`` of the mean too); 0
         unless it arrives.
+    above
+        Upper bounds of the cost of what arrives, on 2^``split`` equal parts of every cell; None
+        where parts were not followed. ``cost`` has its means where they are better.
     optimum
         Of a bracket: bounds of the average over what arrives of the least cost that any control law
         has there, by volume; None without one, or where nothing arrives.
@@ -108,6 +115,7 @@ class Proof(Frozen):
     cost_above: Floats
     cost_below: Floats
     to_stay: bool = False
+    above: Above | None = None
     optimum: tuple[float, float] | None = None
     nonnegative: bool | None = None
     bound: Optimum | None = None
@@ -116,7 +124,7 @@ class Proof(Frozen):
     @classmethod
     def of(
         cls, arrays: dict[str, NDArray[Any]], loop: Loop, *, seconds: float, holds: bool | None,
-        target: float, bound: Optimum | None = None,
+        target: float, above: Above | None = None, bound: Optimum | None = None,
     ) -> Self:  # fmt: skip
         """Return the proof that boxes are."""
         kind, volume = arrays["class"], volumes(arrays["split"])
@@ -134,17 +142,20 @@ class Proof(Frozen):
             return tuple(x.tolist())
 
         arriving = kind == ARRIVES
-        weight, cost, steps = volume[arriving], None, None
+        boxes = {name: array[arriving] for name, array in arrays.items() if name in ARRAYS}
+        dear, weight, cost, steps = boxes["cost"], volume[arriving], None, None
+        if above is not None:
+            dear = np.minimum(dear, means(above.split, above.bound, loop.partition, boxes))
         if arriving.any():
-            low, high = (mean(arrays[name][arriving], weight) for name in ("lower", "cost"))
-            cost, steps = (low, high), int(arrays["level"][arriving].max())
-        bracket = Bracket.of(arrays, loop, bound) if bound is not None else Bracket()
+            cost = mean(boxes["lower"], weight), mean(dear, weight)
+            steps = int(boxes["level"].max())
+        bracket = Bracket.of(boxes, dear, loop, bound) if bound is not None else Bracket()
         witnesses = {"lost": middle(LOST), "stays": middle(STAYS), "undecided": middle(UNDECIDED)}
         return cls(
             share(ARRIVES), share(LOST), share(STAYS), share(UNDECIDED), steps, cost, len(kind),
             seconds, holds, target, witnesses, arrays["cell"], arrays["split"], arrays["place"],
             kind, arrays["level"], arrays["cost"], arrays["lower"], loop.to_stay,
-            *bracket,
+            above, *bracket,
         )  # fmt: skip
 
     @property
@@ -159,6 +170,9 @@ class Proof(Frozen):
             self.cost_below,
         )  # fmt: skip
         kinds = {name: kind for name, (_, kind) in ARRAYS.items()}
+        if self.above is not None:
+            kinds |= ABOVE
+            found += self.above
         if self.bound is not None:
             kinds |= BOUND
             found += (self.bound.split, self.bound.bound)
@@ -166,6 +180,11 @@ class Proof(Frozen):
             name: np.ascontiguousarray(array, dtype=kind)
             for (name, kind), array in zip(kinds.items(), found, strict=True)
         }
+
+    @property
+    def followed(self) -> int | None:
+        """Number of parts that were followed; None where none was."""
+        return None if self.above is None else len(self.above.bound)
 
     @property
     def parts(self) -> int | None:
@@ -183,7 +202,7 @@ class Proof(Frozen):
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         names = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes", "seconds",
-                 "holds", "witnesses", "optimum", "nonnegative", "parts")  # fmt: skip
+                 "holds", "witnesses", "followed", "optimum", "nonnegative", "parts")  # fmt: skip
         return {name: jsonable(getattr(self, name)) for name in names}
 
     def text(self) -> str:

@@ -71,20 +71,34 @@ def exceptions(result, proof, count, seed=0, x=None, box=None):
             slack = 1e-9 * (1 + np.abs(runs.cost))
             bad |= runs.cost > proof.cost_above[b] + slack
             bad |= runs.cost < proof.cost_below[b] - slack
+            if proof.above is not None:
+                most = above_at(proof, result.partition, x[on])
+                bad |= runs.cost > most + 1e-6 * (1 + np.abs(runs.cost))
         wrong[name] = int(bad.sum())
     return wrong
 
 
+def above_at(proof, partition, x):
+    """The upper bound of the part of each state; states are not at faces of parts."""
+    split = proof.above.split.astype(int)
+    shape = partition.cells << split
+    t = (x - partition.low) / (partition.high - partition.low)
+    index = np.clip((t * shape).astype(int), 0, shape - 1)
+    return proof.above.bound.reshape(tuple(shape))[tuple(index.T)].astype(float)
+
+
 def proof_of(path):
     """The result and the proof that a directory holds."""
+    from lmdsl.proof.bounds.flights.refining import Above
     from lmdsl.proof.record import Proof
     from lmdsl.results.directory import archive, proved
 
     stored = archive.read(path)
     result, said = stored.result, stored.certificate.proof
     arrays = proved.read(path, result, said)
+    above = None if said.followed is None else Above(arrays["above_split"], arrays["above"])
     return result, Proof.of(arrays, proved.loop_of(result), seconds=said.seconds, holds=said.holds,
-                            target=said.target)  # fmt: skip
+                            target=said.target, above=above)  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ from problems import made, steps
 import lmdsl as lm
 from lmdsl.cli import main
 from lmdsl.machine.deadline import Deadline
-from lmdsl.proof.optimum import bracket, checking
-from lmdsl.proof.optimum.moves import Parts
+from lmdsl.proof.bounds.optimum import bracket, checking
+from lmdsl.proof.bounds.optimum.moves import Parts
 from lmdsl.results.directory.proved import loop_of
 
 

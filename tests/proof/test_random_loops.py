@@ -11,11 +11,11 @@ import lmdsl as lm
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.successors.compiled import enclosing, places
 from lmdsl.proof import proving
+from lmdsl.proof.bounds.tightening import tighten
 from lmdsl.proof.checking import faults
 from lmdsl.proof.cover import Cover
 from lmdsl.proof.prover import Prover
 from lmdsl.proof.record import Proof
-from lmdsl.proof.tightening import tighten
 from lmdsl.results.directory.proved import loop_of
 
 pytestmark = pytest.mark.long  # in other versions it would find nothing else

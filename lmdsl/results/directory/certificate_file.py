@@ -74,6 +74,7 @@ class ProofKeys(_Keys):
     holds: bool | None
     target: float
     sha256: str = ""
+    followed: Annotated[int, Field(ge=0, lt=2**31)] | None = None
     optimum: Annotated[tuple[Bound, Bound] | None, BeforeValidator(plain)] = None
     nonnegative: bool | None = None
     parts: Annotated[int, Field(ge=0, lt=2**31)] | None = None

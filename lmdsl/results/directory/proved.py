@@ -19,8 +19,9 @@ from lmdsl.model.local.controller import LocalController
 from lmdsl.model.local.holding import HoldingLaw
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof import checking
+from lmdsl.proof.bounds.flights.checking import checked_above
+from lmdsl.proof.bounds.optimum.checking import checked
 from lmdsl.proof.loop import Loop
-from lmdsl.proof.optimum.checking import checked
 from lmdsl.proof.proving import Ending
 from lmdsl.proof.proving import prove as proved
 from lmdsl.proof.record import BOX, Proof, expected
@@ -143,9 +144,10 @@ def _policy(files: Reading, result: Result) -> dict[str, NDArray[Any]]:
 
 def read(path: str | os.PathLike[str], result: Result, said: ProofKeys) -> dict[str, NDArray[Any]]:
     """Read the boxes of a proof."""
-    shapes = expected(said.boxes, result.partition.dimension, said.parts)
+    shapes = expected(said.boxes, result.partition.dimension, said.followed, said.parts)
     each = BOX + 5 * result.partition.dimension
-    memory.require(2.0 * (each * said.boxes + 8 * (said.parts or 0)), "the boxes of the proof")
+    more = 24 * (said.followed or 0) + 8 * (said.parts or 0)
+    memory.require(2.0 * each * said.boxes + more, "the boxes of the proof")
 
     def boxes(files: Reading) -> dict[str, NDArray[Any]]:
         return arrays.unpacked(files.open(NAME, arrays.largest(shapes)), NAME, shapes)
@@ -186,9 +188,11 @@ def _differences(
         return ["the proof is of no controller: control_index lacks a cell of C"]
     found = read(path, result, said)
     loop = loop_of(result)
-    bound = None
+    bound, above = None, None
     entry = np.zeros(result.partition.size, dtype=np.bool_)
     reasons = checking.faults(loop, found, guard, entry)
+    if not reasons and said.followed is not None:
+        above, reasons = checked_above(loop, found, guard)
     if not reasons and said.parts is not None:
         bound, reasons = checked(loop, found, guard)
     if reasons:
@@ -199,6 +203,7 @@ def _differences(
         seconds=said.seconds,
         holds=holds(result, entry),
         target=said.target,
+        above=above,
         bound=bound,
     )
     if said.nonnegative is True and proof.nonnegative is not True:

@@ -17,7 +17,7 @@ from lmdsl.common.types import Bools, Floats, Indices, Progress, Statuses
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.successors.left_out.lossless import Lossless
-from lmdsl.proof.optimum.averages import volumes
+from lmdsl.proof.bounds.optimum.averages import volumes
 from lmdsl.proof.record import TARGET, Proof
 from lmdsl.proof.search import LOST, STAYS, UNDECIDED
 from lmdsl.results.directory.proved import prove

@@ -42,6 +42,10 @@ class Enclosed(NamedTuple):
         Ends of what holds the ways from the start to the control points of the first arc, and of
         what holds the way to its end, shape (B, d, 4). Where the first do not hold 0, the arc
         leaves the start in one direction.
+    middle, slope
+        Where asked for: ends of what holds the images of centres and all that rounds, and of what
+        holds the slopes in between, shapes (B, m, 2) and (B, m, d, 2): the image of x lies in
+        middle + slope (x - centre).
     """
 
     low: Floats
@@ -49,6 +53,8 @@ class Enclosed(NamedTuple):
     stretch: Floats
     arcs: Floats
     way: Floats
+    middle: Floats
+    slope: Floats
 
 
 class Room(NamedTuple):
@@ -70,13 +76,14 @@ def rows(step: Step) -> Room:
     )  # fmt: skip
 
 
-def enclose(step: Step, given: Given, held: Room | None = None) -> Enclosed:
-    """Enclose the step on boxes."""
+def enclose(step: Step, given: Given, held: Room | None = None, sloped: bool = False) -> Enclosed:
+    """Enclose the step on boxes; with the slopes where these are asked for."""
     count, d, m = len(given.low), step.sizes[0], step.sizes[1]
-    arcs = step.substeps if step.path else 0
+    arcs, some = step.substeps if step.path else 0, count if sloped else 0
     found = Enclosed(
         np.empty((count, m)), np.empty((count, m)), np.empty((count, m, d)),
         np.empty((count, arcs, d, 2)), np.empty((count, d if step.path else 0, 4)),
+        np.empty((some, m, 2)), np.empty((some, m, d, 2)),
     )  # fmt: skip
     with np.errstate(all="ignore"):
         _enclose(step, given, rows(step) if held is None else held, found)
@@ -227,6 +234,21 @@ def _knot(found, step, held, at, s):  # type: ignore[no-untyped-def]
                     a, b = abs(rows[out[2 + j], 0, i]), abs(rows[out[2 + j], 1, i])
                     most = a if a > b else b
                 found.stretch[at + i, k, j] = most * (away[j, 1, i] - away[j, 0, i])
+        if len(found.slope) and s + 1 == step.substeps:
+            _slopes(found, out, rows, middle[tapes.middle[k]], k, at)
+
+
+@kernel
+def _slopes(found, out, rows, middle, k, at):  # type: ignore[no-untyped-def]
+    """Note the image of centres and the slopes of component k."""
+    error = rows[out[1]]
+    for i in range(min(BLOCK, len(found.low) - at)):
+        found.middle[at + i, k, 0] = down(middle[0, i] - error[1, i])
+        found.middle[at + i, k, 1] = up(middle[1, i] + error[1, i])
+        for j in range(found.slope.shape[2]):
+            for end in range(2):
+                steep = rows[out[2 + j], end, i] if out[2 + j] >= 0 else 0.0
+                found.slope[at + i, k, j, end] = steep
 
 
 @kernel

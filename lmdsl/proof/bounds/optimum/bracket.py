@@ -10,9 +10,9 @@ from lmdsl.common.types import Floats, Indices, Progress
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline, Stopped
+from lmdsl.proof.bounds.optimum.bounding import SLACK, consistent, prepared, settle
+from lmdsl.proof.bounds.optimum.moves import DEEPEST, Game, Parts
 from lmdsl.proof.loop import Loop
-from lmdsl.proof.optimum.bounding import SLACK, consistent, prepared, settle
-from lmdsl.proof.optimum.moves import DEEPEST, Game, Parts
 
 FEW = 2**22  # rows up to which cells are cut without a time limit
 GROWS = 1.5  # by how much more the time grows than the rows

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Floats, Guard
 from lmdsl.model.grid.boxes import named
-from lmdsl.proof.checking import Arrays
+from lmdsl.proof.bounds.optimum.averages import Arrays
+from lmdsl.proof.bounds.optimum.bounding import prepared, violated
+from lmdsl.proof.bounds.optimum.bracket import Optimum
+from lmdsl.proof.bounds.optimum.moves import DEEPEST, Game, Parts
 from lmdsl.proof.loop import Loop
-from lmdsl.proof.optimum.bounding import prepared, violated
-from lmdsl.proof.optimum.bracket import Optimum
-from lmdsl.proof.optimum.moves import DEEPEST, Game, Parts
 
 
 def checked(loop: Loop, arrays: Arrays, guard: Guard) -> tuple[Optimum | None, list[str]]:

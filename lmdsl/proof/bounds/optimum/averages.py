@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Floats, Indices
 from lmdsl.machine.kernels import kernel
+from lmdsl.model.grid.partition import Partition
+from lmdsl.proof.bounds.optimum.bracket import Optimum
+from lmdsl.proof.bounds.optimum.moves import Parts
 from lmdsl.proof.loop import Loop
-from lmdsl.proof.optimum.bracket import Optimum
-from lmdsl.proof.optimum.moves import Parts
-from lmdsl.proof.search import ARRIVES
+
+Arrays = dict[str, NDArray[Any]]
+Split = NDArray[np.uint8]
 
 
 class Bracket(NamedTuple):
@@ -23,14 +26,13 @@ class Bracket(NamedTuple):
     maps: tuple[Floats, Floats] | None = None
 
     @classmethod
-    def of(cls, arrays: dict[str, NDArray[Any]], loop: Loop, bound: Optimum) -> "Bracket":
-        """Return what a bound says of the boxes of a proof."""
-        some = arrays["class"] == ARRIVES
-        boxes = {name: arrays[name][some] for name in ("cell", "split", "place", "cost")}
-        weight, below = volumes(boxes["split"]), means(bound, loop, boxes)
+    def of(cls, boxes: Arrays, cost: Floats, loop: Loop, bound: Optimum) -> "Bracket":
+        """Return what a bound says of boxes that arrive, of which upper bounds are known."""
+        weight = volumes(boxes["split"])
+        below = means(bound.split, bound.bound, loop.partition, boxes)
         N = loop.partition.size
-        maps = tuple(_by_cell(boxes["cell"], x, weight, N) for x in (below, boxes["cost"]))
-        ends = (mean(below, weight), mean(boxes["cost"], weight)) if len(weight) else None
+        maps = tuple(_by_cell(boxes["cell"], x, weight, N) for x in (below, cost))
+        ends = (mean(below, weight), mean(cost, weight)) if len(weight) else None
         return cls(ends, bound.nonnegative, bound, (maps[0], maps[1]))
 
 
@@ -52,12 +54,12 @@ def mean(x: Floats, weight: Floats) -> float:
     return math.fsum(x * weight) / math.fsum(weight)
 
 
-def means(optimum: Optimum, loop: Loop, boxes: dict[str, NDArray[Any]]) -> Floats:
-    """Return the mean of a bound over each of some boxes: arrays of a proof, shape (B,)."""
-    grid = Parts.of(loop.partition, optimum.split.astype(np.int64))
-    index = np.stack(loop.partition.multi_index(boxes["cell"]), axis=-1)
+def means(split: Split, bound: NDArray[Any], partition: Partition, boxes: Arrays) -> Floats:
+    """Return the means over boxes of a bound on 2^``split`` equal parts of cells, shape (B,)."""
+    parts = Parts.of(partition, split.astype(np.int64))
+    index = np.stack(partition.multi_index(boxes["cell"]), axis=-1)
     found = np.zeros(len(index))
-    _means(optimum.bound, (grid.split, grid.stride), index, boxes["split"], boxes["place"], found)
+    _means(bound, (parts.split, parts.stride), index, boxes["split"], boxes["place"], found)
     return found
 
 

@@ -1,0 +1,175 @@
+"""Upper bounds of the controller's cost on finer and finer equal parts of cells.
+
+What boxes prove is where it begins. Parts are followed for many steps, and those that were torn are
+cut and followed again: the rest of a way is bounded by what is known so far.
+"""
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Bools, Floats, Indices, Progress
+from lmdsl.machine import memory
+from lmdsl.machine.deadline import Deadline, Stopped
+from lmdsl.machine.kernels import kernel
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.proof.bounds.flights.following import Flights, Upper
+from lmdsl.proof.bounds.optimum.averages import Arrays, volumes
+from lmdsl.proof.bounds.optimum.moves import Parts
+from lmdsl.proof.loop import Loop
+from lmdsl.proof.search import ARRIVES, UNDECIDED
+
+SLACK = 2.0**-40  # by how much bounds are raised, relative: see settling.py
+CLOSE = 0.05  # part of the upper bound that the lower one may lack: then it is tight enough
+FEW = 2**18  # parts up to which cells are cut without a time limit
+MOST = 2**27  # parts up to which they are cut at all
+ROUNDS = 16  # by what is known of so many shares of the parts others are bounded in turn
+BYTES = 24  # of a part, with all that is held meanwhile
+DEEPEST = 20  # bisections of an axis
+
+
+class Above(NamedTuple):
+    """An upper bound of the cost of runs that arrive.
+
+    Attributes
+    ----------
+    split
+        Cells are cut into 2^``split`` equal parts by axis, shape (d,).
+    bound
+        By part, in C order: infinite where nothing is known, -infinite where nothing arrives.
+    """
+
+    split: NDArray[np.uint8]
+    bound: Upper
+
+
+def refine(
+    flights: Flights, boxes: Arrays, deadline: Deadline, progress: Progress | None
+) -> Above | None:
+    """Return bounds on parts as fine as time and memory allow; None where none are needed."""
+    loop = flights.loop
+    if not flights.able or _close(boxes):
+        return None
+    found, todo, last = None, None, 0.0
+    split = np.zeros(loop.partition.dimension, dtype=np.int64)
+    while True:
+        parts, began = Parts.of(loop.partition, split), time.monotonic()
+        if found is not None and not _fits(parts, deadline, last):
+            return found
+        known = begun(flights, boxes, parts)
+        if found is not None:
+            np.minimum(known, carried(loop, found, parts), out=known)
+        try:
+            todo = _improved(flights, parts, known, todo, deadline)
+        except Stopped:
+            return Above(split.astype(np.uint8), known)
+        found, last = Above(split.astype(np.uint8), known), time.monotonic() - began
+        if progress is not None:
+            progress("refine", -1.0)
+        if not todo.any() or (split >= DEEPEST).any():
+            return found
+        split = split + 1
+
+
+def _close(boxes: Arrays) -> bool:
+    """Return whether the bounds of boxes are close, or there is nothing to bound."""
+    arrives = boxes["class"] == ARRIVES
+    weight = volumes(boxes["split"][arrives])
+    low, high = ((boxes[name][arrives] * weight).sum() for name in ("lower", "cost"))
+    return bool(not arrives.any() or high - low <= CLOSE * abs(high))
+
+
+def _fits(parts: Parts, deadline: Deadline, last: float) -> bool:
+    """Return whether there is time and memory for so many parts."""
+    left, more = deadline.left, 2.0 ** (len(parts.shape) - 1)
+    if left is None and parts.size > FEW:
+        return False
+    return (
+        parts.size <= MOST
+        and memory.fits(float(BYTES) * parts.size)
+        and (left is None or left > 0.5 * more * last)
+    )
+
+
+def _improved(
+    flights: Flights, parts: Parts, known: Upper, todo: Bools | None, deadline: Deadline
+) -> Bools:
+    """Follow parts that were torn when they were larger; return which are torn still."""
+    some = np.flatnonzero(known > -np.inf) if todo is None else finer(flights.loop, parts, todo)
+    cell = parts.cell(flights.loop.partition, some)
+    some = some[(flights.loop.status[cell] == CellStatus.STABILIZED) & (known[some] > -np.inf)]
+    some = some[np.argsort(known[some], kind="stable")]
+    torn = np.zeros(parts.size, dtype=np.bool_)
+    size = max(len(some) // ROUNDS, 2**14)
+    for start in range(0, len(some), size):
+        if deadline():
+            raise Stopped
+        at = some[start : start + size]
+        bound, whole = flights.bounds(parts, at, known, parts)
+        known[at] = np.minimum(known[at], rounded(bound))
+        torn[at[~whole]] = True
+    return torn
+
+
+def rounded(x: Floats) -> Upper:
+    """Return numbers in single precision, no smaller."""
+    with np.errstate(over="ignore"):
+        near = x.astype(np.float32)
+    return np.where(near < x, np.nextafter(near, np.float32(np.inf)), near)
+
+
+def begun(flights: Flights, boxes: Arrays, parts: Parts) -> Upper:
+    """Return what boxes prove of parts: the largest bound of those that meet it and may arrive."""
+    loop = flights.loop
+    known = np.full(parts.size, -np.inf, dtype=np.float32)
+    targets = np.flatnonzero(loop.status == CellStatus.ATTRACTOR)
+    cells = np.concatenate([boxes["cell"], targets])
+    zeros = np.zeros((len(targets), parts.split.shape[0]), dtype=np.int64)
+    split, place = (np.concatenate([boxes[n].astype(np.int64), zeros]) for n in ("split", "place"))
+    cost = np.where(boxes["class"] == UNDECIDED, np.inf, -np.inf)
+    cost = np.where(boxes["class"] == ARRIVES, boxes["cost"], cost)
+    cost = np.concatenate([cost, flights.entry[targets]])
+    index = np.stack(loop.partition.multi_index(cells), axis=-1)
+    _begin(split, index, place, rounded(cost), (parts.split, parts.stride), known)
+    return known
+
+
+@kernel
+def _begin(split, index, place, cost, grid, known):  # type: ignore[no-untyped-def]
+    fine, stride = grid
+    d = len(fine)
+    for b in range(len(split)):
+        count, first = 1, np.int64(0)
+        for k in range(d):
+            less = fine[k] - split[b, k]
+            at = place[b, k] >> -less if less < 0 else place[b, k] << less
+            first += ((index[b, k] << fine[k]) + at) * stride[k]
+            count *= np.int64(1) << max(less, 0)
+        for j in range(count):
+            rest, at = np.int64(j), first
+            for k in range(d - 1, -1, -1):
+                less = max(fine[k] - split[b, k], 0)
+                at += (rest & ((np.int64(1) << less) - 1)) * stride[k]
+                rest >>= less
+            known[at] = max(known[at], cost[b])
+
+
+def carried(loop: Loop, found: Above, parts: Parts) -> Upper:
+    """Return what is known of larger parts, on smaller ones."""
+    return spread(loop, found.bound, found.split.astype(np.int64), parts)
+
+
+def spread(loop: Loop, values: NDArray[Any], split: Indices, parts: Parts) -> NDArray[Any]:
+    """Return values by larger parts, by smaller ones."""
+    shape = loop.partition.cells.astype(np.int64) << split
+    found = values.reshape(tuple(shape))
+    for k, more in enumerate((parts.split - split).tolist()):
+        found = np.repeat(found, 1 << more, axis=k)
+    return np.ascontiguousarray(found).ravel()
+
+
+def finer(loop: Loop, parts: Parts, todo: Bools) -> Indices:
+    """Return the smaller parts of larger ones that are one bisection an axis larger."""
+    return np.flatnonzero(spread(loop, todo, parts.split - 1, parts))
