@@ -46,7 +46,7 @@ def require(estimate: float, what: str) -> None:
     if estimate > free.bytes:
         raise BadInput(
             f"the problem needs about {human(estimate)} of memory ({what}) and {human(free.bytes)} "
-            f"are available ({free.limit}); use fewer cells, controls or sample points"
+            f"are available ({free.limit}); use fewer cells, controls, sample points or noise nodes"
         )
 
 

@@ -2,11 +2,10 @@
 
 import math
 from dataclasses import dataclass
-from fractions import Fraction
 
 import numpy as np
 
-from lmdsl.common.types import Floats, Indices
+from lmdsl.common.types import Floats, Guard, Indices
 from lmdsl.machine import memory
 from lmdsl.problem.problem import Problem
 
@@ -63,19 +62,23 @@ class Nodes:
     weights: Floats
     group: Indices  # shape (q,): nodes of equal weight share a group, numbered by first appearance
 
-    def group_weights(self) -> list[float]:
-        """Return the weight of each group."""
-        first = np.unique(self.group, return_index=True)[1]
-        return [float(self.weights[i]) for i in first]
+    def exact_weights(self, guard: Guard | None = None) -> tuple[list[int], list[int]]:
+        """Return the weights of the groups as whole numbers of a unit, and their sizes.
+
+        The unit is the largest power of two for which they are whole numbers.
+        """
+        ratios: list[tuple[int, int]] = []
+        for i in np.unique(self.group, return_index=True)[1].tolist():
+            if guard is not None:
+                guard()
+            ratios.append(float(self.weights[i]).as_integer_ratio())
+        unit = max(below for _, below in ratios)  # all are powers of two
+        return [n * (unit // below) for n, below in ratios], np.bincount(self.group).tolist()
 
     def mean(self) -> Floats:
         """Return the mean of every noise variable, shape (r,)."""
         mean: Floats = self.weights @ self.values / self.weights.sum()
         return mean
-
-    def exact_total(self) -> Fraction:
-        """Return the exact sum of the weights."""
-        return sum((Fraction(float(w)) for w in self.weights), Fraction(0))
 
 
 def noise_nodes(problem: Problem) -> Nodes:

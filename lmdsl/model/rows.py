@@ -16,14 +16,13 @@ import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.records import Frozen
-from lmdsl.common.types import Floats, Indices
+from lmdsl.common.types import Floats, Guard, Indices
 from lmdsl.machine import threads
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.discretization import Nodes
@@ -46,24 +45,22 @@ class Shares(Frozen):
     ended: int | None = None
 
     @classmethod
-    def of(cls, points: int, nodes: Nodes) -> Self:
+    def of(cls, points: int, nodes: Nodes, guard: Guard | None = None) -> Self:
         """Return the codes of ``points`` sample points times noise nodes."""
         if len(nodes.weights) == 1:
             codes = points
             return cls(range(1, codes + 1), codes, np.arange(1, codes + 1) / codes, merged=True)
-        exact: list[Fraction] = []
-        sizes = np.bincount(nodes.group)
-        for weight, size in zip(nodes.group_weights(), sizes, strict=True):
-            exact += [Fraction(weight) * count for count in range(1, points * int(size) + 1)]
-        total = points * nodes.exact_total()
-        scale = total.denominator
-        for share in {f.denominator for f in exact}:
-            scale = max(scale, share)  # all are powers of two
-        return cls(
-            numerator=tuple(int(f * scale) for f in exact),
-            total=int(total * scale),
-            value=np.array([float(f / total) for f in exact]),
-        )
+        weights, sizes = nodes.exact_weights(guard)
+        total = points * sum(w * size for w, size in zip(weights, sizes, strict=True))
+        numerator: list[int] = []
+        value: list[float] = []
+        for weight, size in zip(weights, sizes, strict=True):
+            if guard is not None:
+                guard()
+            own = [weight * count for count in range(1, points * size + 1)]
+            numerator += own
+            value += [n / total for n in own]  # whole numbers, so that it is correctly rounded
+        return cls(numerator=tuple(numerator), total=total, value=np.array(value))
 
     def discounted(self, b: float) -> "Shares":
         """Return b times the shares, and as the last code 1 - b: the share of runs that end."""

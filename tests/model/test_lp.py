@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
+from endless import Asked
 from models import dense, random_lp
 from problems import made, standard_map, steps
 
 import lmdsl as lm
+from lmdsl.machine.deadline import TimeLimitReached
 from lmdsl.model import algorithm_1
 from lmdsl.model.algorithm_1 import tree
 from lmdsl.model.discretization import Nodes
@@ -108,6 +111,35 @@ def test_shares_are_exact():
     # Codes: 1..3 samples of the first weight, then of the second, then of the third.
     assert sum(shares.numerator[i] for i in (2, 5, 8)) == shares.total
     np.testing.assert_allclose(shares.value[[0, 3, 6]] * 3, weights, rtol=1e-15)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_shares_are_those_of_rational_arithmetic(seed):
+    rng = np.random.default_rng(seed)
+    weights = rng.random(rng.integers(2, 9)) ** rng.choice([1, 40])
+    weights[rng.random(len(weights)) < 0.4] = weights[0]
+    first, points = list(dict.fromkeys(weights.tolist())), int(rng.integers(1, 5))
+    group = np.array([first.index(w) for w in weights.tolist()])
+    shares = Shares.of(points, Nodes(np.zeros((len(weights), 1)), weights, group))
+    total = points * sum(map(Fraction, weights.tolist()))
+    exact = [
+        Fraction(w) * count / total
+        for w, size in zip(first, np.bincount(group).tolist(), strict=True)
+        for count in range(1, points * size + 1)
+    ]
+    assert [Fraction(n, shares.total) for n in shares.numerator] == exact
+    assert shares.value.tolist() == [float(share) for share in exact]
+    assert any(n % 2 for n in (*shares.numerator, shares.total))  # the unit is the largest
+
+
+def test_many_noise_nodes_do_not_hold_up_a_deadline():
+    """Of unequal weights, so that each has shares of its own."""
+    rng = np.random.default_rng(0)
+    weights, asked = rng.random(10_000), Asked(50)
+    nodes = Nodes(np.zeros((len(weights), 1)), weights, np.arange(len(weights)))
+    with pytest.raises(TimeLimitReached):
+        Shares.of(4, nodes, lambda: asked.raise_if_over("counting"))
+    assert asked.count == 50
 
 
 def brute_stabilizable(pairs, cells):

@@ -14,7 +14,15 @@ from lmdsl.problem.problem import Problem
 
 def require_least(problem: Problem) -> None:
     """Refuse a problem whose grids and cells do not fit, before anything of it is made."""
-    memory.require(estimate(problem), "at least, before sampling")
+    memory.require(estimate(problem), named(problem, "at least, before sampling"))
+
+
+def named(problem: Problem, how: str) -> str:
+    """Return how an estimate was made, and what is large in it beside rows."""
+    parts = discretization.node_count(problem)
+    if problem.successors != "enclosed" or parts == 1:
+        return how
+    return f"{how}; a pair has a range of cells for each of {parts} noise nodes"
 
 
 class Pilot(NamedTuple):

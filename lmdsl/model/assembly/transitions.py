@@ -10,16 +10,17 @@ threads and appended in order, so the rows do not depend on the number of thread
 """
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats, Indices, Progress
+from lmdsl.common.types import Floats, Guard, Indices, Progress
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
-from lmdsl.model.assembly.estimates import Pilot, estimate, require_least, unless_short
+from lmdsl.model.assembly.estimates import Pilot, estimate, named, require_least, unless_short
 from lmdsl.model.assembly.merging import BlockRows, Numbering, merge, merge_one, tile
 from lmdsl.model.assembly.sampler import CHUNK, Block, Sampler
 from lmdsl.model.discretization import Nodes
@@ -88,9 +89,10 @@ def _assembled(
     deadline: Deadline,
 ) -> Transitions:
     pilot = _pilot(sampler, sets)
-    memory.require(estimate(problem, pilot), "estimated from a few cells")
+    memory.require(estimate(problem, pilot), named(problem, "estimated from a few cells"))
     F, M = len(sets.free), len(sampler.controls)
-    shares = shares_of(problem, len(sampler.points), sampler.nodes)
+    guard = partial(deadline.raise_if_over, "compiling")
+    shares = shares_of(problem, len(sampler.points), sampler.nodes, guard)
     pairs = int(F * M * min(1.0, 1.05 * pilot.admissible)) + M
     capacity = int(pairs * (1.05 * pilot.entries + (shares.ended is not None))) + sampler.samples
     pointer, control = _Growing(np.int64, pairs + 1), _Growing(np.int32, pairs)
@@ -125,9 +127,9 @@ def _assembled(
     )
 
 
-def shares_of(problem: Problem, points: int, nodes: Nodes) -> Shares:
+def shares_of(problem: Problem, points: int, nodes: Nodes, guard: Guard | None = None) -> Shares:
     """Return what the codes of a problem's sampled rows stand for."""
-    shares = Shares.of(points, nodes)
+    shares = Shares.of(points, nodes, guard)
     return shares if problem.discount is None else shares.discounted(problem.discount)
 
 

@@ -47,10 +47,13 @@ class Slab(NamedTuple):
         On each axis the first cell and the one after the last.
     controls
         The first control and the one after the last.
+    parts
+        How many parts of the noise at most; None: all.
     """
 
     spans: tuple[tuple[int, int], ...]
     controls: tuple[int, int]
+    parts: int | None = None
 
 
 class Slabs:
@@ -147,7 +150,10 @@ class Slabs:
             ends = domain.pieces(domain.positions(*span), self.pieces[k])
             states.append(Interval(*(self.along(end, k) for end in ends)))
         controls = [self.along(u[slice(*block.controls)], d) for u in self.controls]
-        noise = [Interval(*(self.along(end, d + 1) for end in w)) for w in self.encloser.noise]
+        some = slice(block.parts)
+        noise = [
+            Interval(*(self.along(end[some], d + 1) for end in w)) for w in self.encloser.noise
+        ]
         return StepBoxes(states, controls, noise)
 
     def _spans(self, block: Slab, stretch: Stretch) -> list[Span]:
@@ -229,7 +235,7 @@ def blocks(grid: Slabs) -> Iterator[tuple[Slab, int]]:
     shape, M = grid.partition.shape, grid.controls.shape[1]
     limit = max(LANES, min(MOST_LANES, grid.partition.size * M // SHARED))
     limit = min(limit, MOST_DOUBLES // grid.fast.size) if grid.fast else limit
-    small = Slab(tuple((0, min(2, n)) for n in shape), (0, min(2, M)))
+    small = Slab(tuple((0, min(2, n)) for n in shape), (0, min(2, M)), 2)
     depends = [[n > 1 for n in low.shape] for spans, _ in grid.stretches(small) for low, _ in spans]
 
     def fits(spans: list[int], controls: int) -> bool:
