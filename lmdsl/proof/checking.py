@@ -16,6 +16,7 @@ from lmdsl.model.grid.boxes import named
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof.bounds.optimum.averages import Arrays
 from lmdsl.proof.cover import Cover, node_bytes
+from lmdsl.proof.deciding.settling import stage_bounds, unite_all
 from lmdsl.proof.images.entering import entered
 from lmdsl.proof.images.pieces import DEEPEST
 from lmdsl.proof.loop import Loop
@@ -30,7 +31,6 @@ from lmdsl.proof.search import (
     STAYS,
     meet,
 )
-from lmdsl.proof.settling import stage_bounds, unite_all
 
 SOME = 2**16  # boxes checked between two looks at the clock
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.proof.deciding.rounds import halve
 from lmdsl.proof.search import ARRIVES, LOST, UNDECIDED, measure
 
 
@@ -26,6 +27,9 @@ class Tree(NamedTuple):
         Cell, node above (-1: none) and first of the two nodes below (-1: a leaf).
     axis
         Along which it is or would be bisected.
+    way
+        Shape (nodes, 2), what a search for undecided leaves reads: of an undecided node that is
+        bisected, child * 16 + axis and the place of its middle; of others -1 less the state.
     split, place
         Shape (nodes, d): see the module.
     state, flags
@@ -45,6 +49,7 @@ class Tree(NamedTuple):
     parent: NDArray[np.int32]
     child: NDArray[np.int32]
     axis: NDArray[np.int8]
+    way: NDArray[np.int64]
     split: NDArray[np.uint8]
     place: NDArray[np.uint32]
     state: NDArray[np.uint8]
@@ -62,17 +67,18 @@ class Tree(NamedTuple):
 
 
 _KINDS = {
-    "cell": "i4", "parent": "i4", "child": "i4", "axis": "i1", "split": "u1", "place": "u4",
-    "state": "u1", "flags": "u1", "level": "i4", "cost": "f8", "least": "f8", "dearest": "f8",
-    "cheapest": "f8", "first": "i8", "images": "i4", "waits": "i4", "waiting": "i4",
-    "following": "i4",
+    "cell": "i4", "parent": "i4", "child": "i4", "axis": "i1", "way": "i8", "split": "u1",
+    "place": "u4", "state": "u1", "flags": "u1", "level": "i4", "cost": "f8", "least": "f8",
+    "dearest": "f8", "cheapest": "f8", "first": "i8", "images": "i4", "waits": "i4",
+    "waiting": "i4", "following": "i4",
 }  # fmt: skip
-_NONE = ("parent", "child", "waits", "waiting", "following")
+_WIDE = {"way": 2}  # entries a node; of others one, or one an axis
+_NONE = ("way", "parent", "child", "waits", "waiting", "following")
 
 
 def node_bytes(d: int, images: int) -> int:
     """Return the bytes of a node with so many images."""
-    return 85 + 5 * d + 16 * d * images
+    return 130 + 5 * d + 16 * d * images
 
 
 class Cover:
@@ -105,6 +111,7 @@ class Cover:
         arrays: dict[str, Any] = {}
         for name, kind in _KINDS.items():
             shape = (size, d) if name in ("split", "place") else (size,)
+            shape = (size, _WIDE[name]) if name in _WIDE else shape
             arrays[name] = np.full(shape, -1 if name in _NONE else 0, dtype=kind)
         return Tree(**arrays)
 
@@ -130,17 +137,7 @@ class Cover:
     def bisect(self, nodes: Indices) -> Indices:
         """Bisect leaves along their axes; return the new nodes."""
         self.grow(2 * len(nodes))
-        tree, first = self.tree, self.count + 2 * np.arange(len(nodes))
-        tree.child[nodes] = first
-        axis = tree.axis[nodes]
-        for half in (0, 1):
-            new = first + half
-            for name in ("cell", "split", "place", "flags", "axis"):
-                getattr(tree, name)[new] = getattr(tree, name)[nodes]
-            tree.parent[new] = nodes
-            tree.split[new, axis] += 1
-            tree.place[new, axis] = 2 * tree.place[new, axis] + half
-            tree.state[new] = UNDECIDED
+        halve(self.tree, nodes, self.count)
         self.count += 2 * len(nodes)
         return np.arange(self.count - 2 * len(nodes), self.count)
 

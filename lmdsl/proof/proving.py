@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from lmdsl.common.types import Bools, Floats, Indices, Progress, Statuses
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
-from lmdsl.proof import settling
 from lmdsl.proof.bounds.flights.following import Flights
 from lmdsl.proof.bounds.flights.refining import SLACK as RAISED
 from lmdsl.proof.bounds.flights.refining import refine
 from lmdsl.proof.bounds.optimum.bracket import bound as best
 from lmdsl.proof.bounds.tightening import tighten
 from lmdsl.proof.cover import Cover, node_bytes
+from lmdsl.proof.deciding import settling
 from lmdsl.proof.images.entering import entered
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.prover import Prover

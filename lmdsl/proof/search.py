@@ -11,7 +11,7 @@ from lmdsl.model.successors.compiled.places import BITS, LAST, MAY_ARRIVE, MAY_L
 
 UNDECIDED, ARRIVES, LOST, STAYS = range(4)  # states of nodes
 MEETS_UNDECIDED, MEETS_ARRIVING, MEETS_LOST, MEETS_STAYING = 1, 2, 4, 8  # 1 << state
-ANY, EVERY, LEAVING = range(3)  # what ends a search: an undecided leaf, nothing, leaving a set
+EVERY, LEAVING = range(2)  # what ends a search: nothing, or leaving a set
 
 
 class Met(NamedTuple):
@@ -94,7 +94,7 @@ def tally(tree, count, volume):  # type: ignore[no-untyped-def]
 
 @kernel
 def meet(search, b, until):  # type: ignore[no-untyped-def]
-    """Return what the images of a node meet; at once, when an undecided leaf is, unless EVERY."""
+    """Return what the images of a node meet; until it is known to be LEAVING, or EVERY node."""
     tree = search.tree
     bits, least, most = 0, search.entry[0], search.entry[1]
     if tree.flags[b] & MAY_LEAVE:

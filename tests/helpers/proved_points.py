@@ -27,17 +27,13 @@ def boxes_of(proof, cells):
 
 def box_at(proof, partition, x):
     """The box of a state, by its cell and its place there; -1 outside C."""
-    state, (cell,) = partition.enter(x[None])
-    at = []
-    for i in np.flatnonzero(proof.cell == cell):
-        t = (state[0] - partition.low) / partition.width - np.array(
-            partition.multi_index(np.array([cell]))
-        ).ravel()
-        t = np.where(partition.periodic & (t > partition.cells / 2), 0.0, t)
-        where = np.floor(np.clip(t, 0, 1 - 2.0**-33) * 2.0 ** proof.split[i])
-        if (where == proof.place[i]).all():
-            at.append(i)
-    return at[0] if at else -1
+    state, cell = partition.enter(x[None])
+    of_cell = np.flatnonzero(proof.cell == cell[0])
+    t = (state[0] - partition.low) / partition.width - np.ravel(partition.multi_index(cell))
+    t = np.where(partition.periodic & (t > partition.cells / 2), 0.0, t)
+    where = np.floor(np.clip(t, 0, 1 - 2.0**-33) * 2.0 ** proof.split[of_cell])
+    at = of_cell[(where == proof.place[of_cell]).all(axis=1)]
+    return at[0] if len(at) else -1
 
 
 def drawn(proof, partition, count, rng):

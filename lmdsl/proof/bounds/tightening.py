@@ -7,7 +7,7 @@ import numpy as np
 
 from lmdsl.common.types import Floats, Indices, Progress
 from lmdsl.machine.deadline import Deadline
-from lmdsl.proof import settling
+from lmdsl.proof.deciding import settling
 from lmdsl.proof.images.seen import deep
 from lmdsl.proof.prover import Prover
 from lmdsl.proof.search import ARRIVES
