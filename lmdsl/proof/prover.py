@@ -117,7 +117,7 @@ class Prover:
                 nodes, after = after, nodes
             self._seek(nodes[:size], found)
             self._level += 1
-            size = rounds.note(find.tree, nodes[:size], found, after, self._shares, self._level)
+            size = rounds.note(find, nodes[:size], found, after, self._shares, self._level)
             self._room = [after, nodes, found]
 
     def _seek(self, nodes: NDArray[np.int32], found: NDArray[np.int32]) -> None:

@@ -14,7 +14,7 @@ from lmdsl.proof.bounds.flights.following import Flights
 from lmdsl.proof.bounds.flights.refining import SLACK as RAISED
 from lmdsl.proof.bounds.flights.refining import refine
 from lmdsl.proof.bounds.optimum.bracket import bound as best
-from lmdsl.proof.bounds.tightening import tighten
+from lmdsl.proof.bounds.tightening import arriving, tighten
 from lmdsl.proof.cover import Cover, node_bytes
 from lmdsl.proof.deciding import settling
 from lmdsl.proof.images.entering import entered
@@ -63,8 +63,8 @@ def prove(
     arrays = boxes(prover)
     leaves = prover.cover.leaves()
     leaves = leaves[(prover.cover.tree.images[leaves] > 0)]
-    arriving = leaves[prover.cover.tree.state[leaves] == ARRIVES]
-    kept = holds(entered(prover.cover, arriving, loop.attractor))
+    ends = leaves[prover.cover.tree.state[leaves] == ARRIVES]
+    kept = holds(entered(prover.cover, ends, loop.attractor))
     del prover
     above = refine(flights, arrays, deadline, progress) if bounded else None
     bound = best(loop, _most(arrays), whole, progress, SLACK) if bracket else None
@@ -96,6 +96,8 @@ def _work(
     prover.run(enough, Deadline(left and DECIDING * left), progress)
     few = max(GROWN * len(prover.cover.leaves()), FEW)
     if ended():
+        leaves = arriving(prover)
+        settling.refine(prover.search, leaves, prover.factor, np.zeros(len(leaves)))
         return False
     some = deadline
     if flights.able and deadline.left is not None:

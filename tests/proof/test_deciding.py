@@ -73,8 +73,11 @@ def test_levels_follow_from_what_is_met(result):
     prover = decided(result)
     tree, leaves = prover.cover.tree, prover.cover.leaves()
     for b in leaves[tree.images[leaves] > 0]:
-        if tree.state[b] in (ARRIVES, LOST):
-            assert tree.level[b] > meet(prover.search, b, EVERY).level
+        met = meet(prover.search, b, EVERY)
+        if tree.state[b] == LOST:
+            assert tree.level[b] == met.level + 1
+        elif tree.state[b] == ARRIVES:
+            assert tree.level[b] > met.level
 
 
 def test_what_stays_is_the_greatest_set(result):

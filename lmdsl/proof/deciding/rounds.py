@@ -12,12 +12,14 @@ from lmdsl.machine.kernels import kernel
 from lmdsl.model.successors.compiled.places import BITS, LAST, MAY_ARRIVE, MAY_LEAVE
 from lmdsl.proof.search import (
     ARRIVES,
+    EVERY,
     LOST,
     MEETS_ARRIVING,
     MEETS_LOST,
     STAYS,
     UNDECIDED,
     depth,
+    meet,
 )
 
 AXES = 16  # one more than the number of the last axis: a way is child * AXES + axis
@@ -163,17 +165,19 @@ def decide(tree, b, state, level):  # type: ignore[no-untyped-def]
     while n >= 0:
         if tree.state[tree.child[n]] != state or tree.state[tree.child[n] + 1] != state:
             break
-        tree.state[n], tree.level[n], tree.way[n, 0] = state, level, -1 - np.int64(state)
+        tree.state[n], tree.way[n, 0] = state, -1 - np.int64(state)
+        tree.level[n] = max(tree.level[tree.child[n]], tree.level[tree.child[n] + 1])
         n = tree.parent[n]
 
 
 @kernel
-def note(tree, nodes, found, after, shares, level):  # type: ignore[no-untyped-def]
+def note(search, nodes, found, after, shares, level):  # type: ignore[no-untyped-def]
     """Note what was found of nodes; return how many are to be looked at next, in ``after``.
 
-    ``level`` of what is decided now is above that of all that was. ``shares`` is by state.
+    ``level`` of what arrives now is above that of all that did; it is no number of steps until
+    bounds are worked out (settling.py). That of what is lost is. ``shares`` is by state.
     """
-    size = 0
+    tree, size = search.tree, 0
     for j in range(len(nodes)):
         b, leaf = nodes[j], found[j]
         if leaf >= 0:
@@ -188,7 +192,7 @@ def note(tree, nodes, found, after, shares, level):  # type: ignore[no-untyped-d
         if (bits == 0) | (bits & (bits - 1) != 0):
             continue  # it meets what ends differently: only bisecting helps
         state = ARRIVES if bits == MEETS_ARRIVING else LOST if bits == MEETS_LOST else STAYS
-        decide(tree, b, state, level)
+        decide(tree, b, state, meet(search, b, EVERY).level + 1 if state == LOST else level)
         shares[state] += 0.5 ** depth(tree, b)
         size = wake(tree, b, after, size)
     return size
@@ -219,7 +223,7 @@ def settle(search, room, size, shares, level, most):  # type: ignore[no-untyped-
     while (size > 0) & (size <= most):
         seek(search, nodes[:size], found)
         level += 1
-        size = note(search.tree, nodes[:size], found, after, shares, level)
+        size = note(search, nodes[:size], found, after, shares, level)
         for j in range(size):
             nodes[j] = after[j]
     return size, level
