@@ -30,8 +30,8 @@ SLACK = 2.0**-36
 # Without a time limit bounds of the cost are tightened until there are so many times as many boxes,
 # or so many.
 GROWN, FEW = 4, 200_000
-BRACKET = 0.4  # part of a time limit that is kept for a lower bound of what any law costs
-BOXED = 0.3  # part of what is left then for boxes, where parts of cells can be followed after it
+BRACKET = 0.3  # part of a time limit that is kept for a lower bound of what any law costs
+BOXED = 0.2  # part of what is left then for boxes, where parts of cells can be followed after it
 DECIDING = 0.7  # part of a time limit after which no more is decided, and bounds are tightened
 
 

@@ -15,6 +15,7 @@ from problems import made, steps
 import lmdsl as lm
 from lmdsl.cli import main
 from lmdsl.machine.deadline import Deadline
+from lmdsl.proof import proving
 from lmdsl.proof.bounds.optimum import bracket, checking
 from lmdsl.proof.bounds.optimum.moves import Parts
 from lmdsl.results.directory.proved import loop_of
@@ -49,6 +50,12 @@ def at(bound, loop, x):
     grid = Parts.of(partition, bound.split.astype(np.int64))
     index = np.minimum((t * grid.shape).astype(np.int64), grid.shape - 1)
     return bound.bound[(index * grid.stride).sum(axis=1)]
+
+
+def few_boxes(patch):
+    """Let boxes be bisected no further for the sake of their bounds."""
+    patch.setattr(proving, "FEW", 0)
+    patch.setattr(proving, "GROWN", 1)
 
 
 def starts(loop, count, seed=0):
@@ -265,6 +272,7 @@ def test_what_is_no_bound_is_refused():
 
 def test_brackets_are_kept_and_verified(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(bracket, "FEW", 2**12)
+    few_boxes(monkeypatch)
     folder = tmp_path / "out"
     result = lm.solve(made(PLANE))
     result.save(folder)
@@ -302,3 +310,39 @@ def test_time_that_is_too_short_leaves_a_bound():
     assert proof.optimum is None or proof.optimum[0] >= 0
     bound = bracket.bound(loop_of(result), 10.0, Deadline(1e-9), None, 0.0)
     assert checked(bound, loop_of(result)) == []
+
+
+def test_maps_are_drawn(monkeypatch):
+    """The picture holds the map, cell by cell."""
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(bracket, "FEW", 2**10)
+    few_boxes(monkeypatch)
+    result = lm.solve(made(PLANE))
+    proof = result.prove(0.9, bracket=True)
+    below, above = proof.maps
+    for side, wanted in (("below", below), ("above", above), ("ratio", below / above)):
+        ax = lm.plotting.bracket(result, proof, side)
+        (picture,) = [image for image in ax.images if image.get_array().shape == (6, 6)][:1]
+        drawn = np.ma.filled(picture.get_array(), np.nan).T
+        np.testing.assert_allclose(drawn, wanted.reshape(6, 6))
+    with pytest.raises(lm.BadInput, match="side"):
+        lm.plotting.bracket(result, proof, "left")
+    with pytest.raises(lm.BadInput, match="bracket=True"):
+        lm.plotting.bracket(result, result.prove(0.9))
+    with pytest.raises(lm.BadInput, match="another"):
+        lm.plotting.bracket(lm.solve(made(walk())), proof)
+
+
+def test_the_benchmark_runs(capsys, monkeypatch, tmp_path):
+    """The bracket of the standard map on few cells: bounds on both sides of what runs cost."""
+    pytest.importorskip("matplotlib")
+    from benchmarks import bracket as benchmark
+
+    monkeypatch.setattr(benchmark, "RUNS", 2_000)
+    monkeypatch.setattr(bracket, "FEW", 2**14)
+    few_boxes(monkeypatch)
+    row, result, proof = benchmark.measured(20, None, 0.5)
+    assert 0 < row.below < row.mean * 1.05
+    assert row.mean < row.above * 1.05
+    benchmark.drawn([row], result, proof, tmp_path / "bracket.png")
+    assert (tmp_path / "bracket.png").stat().st_size > 10_000

@@ -5,6 +5,7 @@ cut and followed again: the rest of a way is bounded by what is known so far.
 """
 
 import time
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,8 +25,9 @@ from lmdsl.proof.search import ARRIVES, UNDECIDED
 SLACK = 2.0**-40  # by how much bounds are raised, relative: see settling.py
 CLOSE = 0.05  # part of the upper bound that the lower one may lack: then it is tight enough
 FEW = 2**18  # parts up to which cells are cut without a time limit
-MOST = 2**27  # parts up to which they are cut at all
+MOST = 2**26  # parts up to which they are cut at all
 ROUNDS = 16  # by what is known of so many shares of the parts others are bounded in turn
+HELPED = 0.99  # of the mean bound, above which following the same parts again has not helped
 BYTES = 24  # of a part, with all that is held meanwhile
 DEEPEST = 20  # bisections of an axis
 
@@ -52,17 +54,18 @@ def refine(
     loop = flights.loop
     if not flights.able or _close(boxes):
         return None
-    found, todo, last = None, None, 0.0
+    found, todo, last = None, np.zeros(0, dtype=np.bool_), 0.0
     split = np.zeros(loop.partition.dimension, dtype=np.int64)
     while True:
         parts, began = Parts.of(loop.partition, split), time.monotonic()
         if found is not None and not _fits(parts, deadline, last):
-            return found
+            return _again(flights, found, todo, deadline, last)
         known = begun(flights, boxes, parts)
         if found is not None:
             np.minimum(known, carried(loop, found, parts), out=known)
         try:
-            todo = _improved(flights, parts, known, todo, deadline)
+            some = np.arange(parts.size) if found is None else finer(loop, parts, todo)
+            todo = _improved(flights, parts, known, some, deadline)
         except Stopped:
             return Above(split.astype(np.uint8), known)
         found, last = Above(split.astype(np.uint8), known), time.monotonic() - began
@@ -71,6 +74,21 @@ def refine(
         if not todo.any() or (split >= DEEPEST).any():
             return found
         split = split + 1
+
+
+def _again(flights: Flights, found: Above, todo: Bools, deadline: Deadline, last: float) -> Above:
+    """Follow parts that are torn again, by what is known of others now, while that helps."""
+    parts, known = Parts.of(flights.loop.partition, found.split.astype(np.int64)), found.bound
+    mean = np.inf
+    while deadline.left is not None and deadline.left > last:
+        finite = known[np.isfinite(known)].mean(dtype=np.float64)
+        if not finite < HELPED * mean:
+            break
+        began, mean = time.monotonic(), finite
+        with suppress(Stopped):
+            todo = _improved(flights, parts, known, np.flatnonzero(todo), deadline)
+        last = time.monotonic() - began
+    return found
 
 
 def _close(boxes: Arrays) -> bool:
@@ -94,10 +112,9 @@ def _fits(parts: Parts, deadline: Deadline, last: float) -> bool:
 
 
 def _improved(
-    flights: Flights, parts: Parts, known: Upper, todo: Bools | None, deadline: Deadline
+    flights: Flights, parts: Parts, known: Upper, some: Indices, deadline: Deadline
 ) -> Bools:
-    """Follow parts that were torn when they were larger; return which are torn still."""
-    some = np.flatnonzero(known > -np.inf) if todo is None else finer(flights.loop, parts, todo)
+    """Follow some parts; return which are torn still."""
     cell = parts.cell(flights.loop.partition, some)
     some = some[(flights.loop.status[cell] == CellStatus.STABILIZED) & (known[some] > -np.inf)]
     some = some[np.argsort(known[some], kind="stable")]
