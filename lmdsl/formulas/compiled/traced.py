@@ -298,13 +298,12 @@ _PLAIN: Final[dict[str, Callable[..., Any]]] = {
 }  # fmt: skip
 
 
-def trace(program: Program, values: Mapping[str, Traced]) -> tuple[Traced, ...]:
-    """Return the jets of all formulas of a program, given those of its names.
-
-    A formula that is a condition has the row of a condition.
-    """
-    like = next(iter(values.values()))
-    slots: list[Any] = [None if value is None else like.like(value) for value in program.template]
+def trace(
+    program: Program, values: Mapping[str, Traced], slots: list[Any] | None = None
+) -> tuple[Traced, ...]:
+    """Return the jets, of conditions the rows, of all formulas; ``slots`` takes all on the way."""
+    like, slots = next(iter(values.values())), [] if slots is None else slots
+    slots += [None if value is None else like.like(value) for value in program.template]
     for name, slot in program.variables.items():
         slots[slot] = values[name]
     for operation, operands, target, *_ in program.instructions:

@@ -77,7 +77,7 @@ def rows(step: Step) -> Room:
 
 
 def enclose(step: Step, given: Given, held: Room | None = None, sloped: bool = False) -> Enclosed:
-    """Enclose the step on boxes; with the slopes where these are asked for."""
+    """Enclose the step on boxes; with slopes if these are asked for. NaN is surely no number."""
     count, d, m = len(given.low), step.sizes[0], step.sizes[1]
     arcs, some = step.substeps if step.path else 0, count if sloped else 0
     found = Enclosed(
@@ -87,6 +87,9 @@ def enclose(step: Step, given: Given, held: Room | None = None, sloped: bool = F
     )  # fmt: skip
     with np.errstate(all="ignore"):
         _enclose(step, given, rows(step) if held is None else held, found)
+    if len(step.nowhere.middle):
+        gone = ranges(step, step.nowhere, given)[0][:, 0] > 0.0
+        found.low[gone, :d] = found.high[gone, :d] = found.arcs[gone] = np.nan
     return found
 
 

@@ -57,8 +57,11 @@ def part(x, k, axis, sign):  # type: ignore[no-untyped-def]
 def located(low, high, axis, clip, slack):  # type: ignore[no-untyped-def]
     """Return the first and the last place of images in [low, high], and what else they may do.
 
-    On a circle the last place may be a turn further. ``slack`` widens the range, in cells.
+    On a circle the last place may be a turn further. ``slack`` widens the range, in cells. What is
+    surely no number, NaN, is out.
     """
+    if np.isnan(low):
+        return np.int64(0), np.int64(0), MAY_LEAVE | EMPTY
     cells, flags = axis[3], 0
     low, high = low - slack * axis[2], high + slack * axis[2]
     if not high - low < np.inf:
@@ -108,6 +111,9 @@ def follow(found, start, ground, flags):  # type: ignore[no-untyped-def]
     first, last = np.empty(d), np.empty(d)
     for b in range(len(flags)):
         for s in range(found.arcs.shape[1]):
+            if np.isnan(found.arcs[b, s, 0, 0]):
+                flags[b] |= MAY_LEAVE
+                continue
             for k in range(d):
                 low, high = found.arcs[b, s, k, 0], found.arcs[b, s, k, 1]
                 error = tolerance * max(abs(low), abs(high))

@@ -15,6 +15,7 @@ from lmdsl.errors import BadInput
 from lmdsl.formulas.compiled.machine import IntervalTape
 from lmdsl.formulas.compiled.tape import ONE, ZERO, Value, Writer
 from lmdsl.formulas.compiled.traced import Traced, trace
+from lmdsl.formulas.compiled.undefined import Flag, as_number, never_a_number
 from lmdsl.formulas.program import Program
 from lmdsl.problem.consistency import texts
 from lmdsl.problem.problem import Problem
@@ -57,6 +58,9 @@ class Step(NamedTuple):
         Of the last knot a - m/3, and m/3.
     cost, terminal
         The stage cost, and the terminal cost in a state; without outputs where there is none.
+    nowhere
+        1 where the image is certainly no number, and so is all of a path but its start; without
+        outputs where it never is.
     substeps
         Number of substeps; 1 for a map.
     path
@@ -69,6 +73,7 @@ class Step(NamedTuple):
     end: Tapes
     cost: Tapes
     terminal: Tapes
+    nowhere: Tapes
     substeps: int
     path: bool
     sizes: tuple[int, int, int, int]
@@ -102,7 +107,7 @@ def step(problem: Problem) -> Step:
     plain = Maker(states, names, len(states), seeded=True)
     return Step(
         advance, end, plain.program(stage), plain.program(problem.terminal()),
-        getattr(advances, "substeps", 1), path,
+        plain.nowhere(advances), getattr(advances, "substeps", 1), path,
         (len(states), make.components, len(names[0]), len(names[1])),
     )  # fmt: skip
 
@@ -199,6 +204,31 @@ class Maker:
             found += thirds
             found += [(h / 6) * (k1[i] + 2 * k2[i] + 2 * k3[i] + k4[i]) for i in range(d)]
         return found
+
+    def nowhere(self, map_: Program | RungeKutta) -> Tapes:
+        """Return the tapes of what is 1 where images are no numbers; of a flow, after a substep."""
+        d = len(self.states)
+        program = map_ if isinstance(map_, Program) else map_.field.part(map_.field.outputs[:d])
+
+        def found(directions: int) -> list[Traced]:
+            writer, held, parts = self.given(directions)
+            flags: list[Flag] = []
+
+            def slope(at: Sequence[Traced]) -> tuple[Traced, ...]:
+                held.update(zip(self.states, at, strict=True))
+                slots: list[Any] = []
+                images = trace(program, held, slots)
+                flags.extend(never_a_number(program, slots, d, writer))
+                return images
+
+            if isinstance(map_, Program):
+                slope(parts)
+            else:
+                next(iter(rk4(slope, tuple(parts), map_.h, 1)))
+            jet = as_number(writer, flags, directions)
+            return [] if jet is None else [jet]
+
+        return self.made(found(self.directions), found(0))
 
     def knot(self, flow: RungeKutta) -> Tapes:
         """Return the tapes of the last control point before a knot."""
