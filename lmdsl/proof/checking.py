@@ -14,6 +14,7 @@ from lmdsl.machine import memory
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.boxes import named
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.proof.bounds import chance
 from lmdsl.proof.bounds.optimum.averages import Arrays
 from lmdsl.proof.cover import Cover, node_bytes
 from lmdsl.proof.deciding.settling import stage_bounds, unite_all
@@ -76,7 +77,15 @@ def faults(loop: Loop, arrays: Arrays, guard: Guard, entry: Bools | None = None)
         prover.enclose(place[start : start + SOME])
     if entry is not None:
         entry |= entered(cover, place[arrays["class"] == ARRIVES], loop.attractor)
-    return _judged(prover, arrays, place, guard)
+    found = _judged(prover, arrays, place, guard)
+    if found or "probability" not in arrays:
+        return found
+    guard()
+    return [
+        f"proof.npz: box {i} of {named(partition, int(arrays['cell'][i]))} is said to arrive with "
+        f"a probability of at least {arrays['probability'][i].item()!r}, but it may be less"
+        for i in chance.unproved(prover, place, arrays["probability"])[:3]
+    ]
 
 
 def _malformed(loop: Loop, arrays: Arrays) -> str:

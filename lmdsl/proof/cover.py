@@ -78,7 +78,7 @@ _NONE = ("way", "parent", "child", "waits", "waiting", "following")
 
 def node_bytes(d: int, images: int) -> int:
     """Return the bytes of a node with so many images."""
-    return 130 + 5 * d + 16 * d * images
+    return 130 + 5 * d + (16 * d + 1) * images
 
 
 class Cover:
@@ -88,8 +88,8 @@ class Cover:
     ----------
     partition
         The cells.
-    tree, places
-        The nodes, and the places of their images, shape (images, d, 2).
+    tree, places, more
+        The nodes, the places of their images, shape (images, d, 2), and what these may do besides.
     count, used
         Number of nodes and of images.
     """
@@ -98,6 +98,7 @@ class Cover:
         self.partition, N, d = partition, partition.size, partition.dimension
         self.tree = self._empty(max(2 * N, 1024))
         self.places = np.zeros((max(N, 1024), d, 2), dtype=np.int64)
+        self.more = np.zeros(len(self.places), dtype=np.uint8)
         self.count, self.used = N, 0
         tree = self.tree
         tree.cell[:N] = np.arange(N)
@@ -150,5 +151,6 @@ class Cover:
                               dtype=np.int64)  # fmt: skip
             larger[: self.used] = self.places[: self.used]
             self.places = larger
+            self.more = np.append(self.more, np.zeros(len(larger) - len(self.more), dtype=np.uint8))
         self.used = total
         return np.asarray(first[:-1])

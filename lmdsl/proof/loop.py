@@ -48,6 +48,11 @@ class Loop(NamedTuple):
         return np.asarray(self.status == CellStatus.ATTRACTOR)
 
     @property
+    def noisy(self) -> bool:
+        """Whether there is noise."""
+        return bool(self.problem.noises)
+
+    @property
     def to_stay(self) -> bool:
         """Whether there is no attractor, so that staying is what is wanted."""
         return bool(self.problem.attractor.empty)

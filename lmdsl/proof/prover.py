@@ -85,7 +85,8 @@ class Prover:
             seen = self.images(tree.cell[nodes], tree.split[nodes], tree.place[nodes])
             count = np.bincount(seen.owner, minlength=len(nodes))
             tree.first[nodes], tree.images[nodes] = self.cover.keep(count), count
-            self.cover.places[self.cover.used - len(seen.owner) : self.cover.used] = seen.place
+            at = slice(self.cover.used - len(seen.owner), self.cover.used)
+            self.cover.places[at], self.cover.more[at] = seen.place, seen.more
             tree.flags[nodes], tree.axis[nodes] = seen.flags, seen.axis
             tree.dearest[nodes], tree.cheapest[nodes] = seen.dearest, seen.cheapest
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lmdsl.common.types import Bools, Floats, Indices, Progress, Statuses
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
+from lmdsl.proof.bounds.chance import chances
 from lmdsl.proof.bounds.flights.following import Flights
 from lmdsl.proof.bounds.flights.refining import SLACK as RAISED
 from lmdsl.proof.bounds.flights.refining import refine
@@ -32,6 +33,7 @@ SLACK = 2.0**-36
 GROWN, FEW = 4, 200_000
 BRACKET = 0.3  # part of a time limit that is kept for a lower bound of what any law costs
 BOXED = 0.2  # part of what is left then for boxes, where parts of cells can be followed after it
+CHANCE = 0.15  # part that is kept for the probability to arrive, with noise
 DECIDING = 0.7  # part of a time limit after which no more is decided, and bounds are tightened
 
 
@@ -58,9 +60,13 @@ def prove(
         left *= 1.0 - BRACKET
         deadline = Deadline(left)
     prover = Prover(Cover(partition, loop.status), images, loop.factor, loop.entry(images))
+    likely = loop.noisy and not loop.to_stay
+    if likely and left is not None:
+        left *= 1.0 - CHANCE
+        deadline = Deadline(left)
     flights = Flights(loop, SLACK, RAISED)
     bounded = _work((prover, flights), loop, target, deadline, progress, ending)
-    arrays = boxes(prover)
+    arrays = boxes(prover, chances(prover, Deadline(left and CHANCE * left)) if likely else None)
     leaves = prover.cover.leaves()
     leaves = leaves[(prover.cover.tree.images[leaves] > 0)]
     ends = leaves[prover.cover.tree.state[leaves] == ARRIVES]
@@ -119,8 +125,10 @@ def _most(arrays: dict[str, NDArray[Any]]) -> float:
     return 2.0 * float(cost[np.isfinite(cost)].max(initial=1.0))
 
 
-def boxes(prover: Prover) -> dict[str, NDArray[Any]]:
+def boxes(prover: Prover, chance: Floats | None = None) -> dict[str, NDArray[Any]]:
     """Return the arrays of a proof, the leaves by cell, once bounds are tightened.
+
+    ``chance`` is by node.
 
     So are levels of what arrives; those of what is lost are here.
     """
@@ -140,4 +148,5 @@ def boxes(prover: Prover) -> dict[str, NDArray[Any]]:
         "level": np.where(ends, tree.level[leaves], 0).astype(np.int32),
         "cost": np.where(arrives, tree.cost[leaves], 0.0),
         "lower": np.where(arrives, tree.least[leaves], 0.0),
+        **({} if chance is None else {"probability": chance[leaves]}),
     }  # fmt: skip

@@ -28,18 +28,25 @@ ARRAYS: dict[str, tuple[bool, str]] = {  # by axis too, and the kind
 }  # fmt: skip
 # Bounds on equal parts of cells: of runs that arrive, and of a bracket.
 ABOVE: dict[str, str] = {"above_split": "|u1", "above": "<f4"}
+CHANCE: dict[str, str] = {"probability": "<f8"}  # of boxes, with noise
 BOUND: dict[str, str] = {"optimum_split": "|u1", "optimum": "<f8"}
 BOX = 40  # bytes of a box but for its axes
 
 
 def expected(
-    boxes: int, axes: int, followed: int | None = None, parts: int | None = None
+    boxes: int,
+    axes: int,
+    followed: int | None = None,
+    parts: int | None = None,
+    chance: bool = False,
 ) -> dict[str, tuple[tuple[int, ...], str]]:
     """Return the shapes and kinds of the arrays of so many boxes, and of the parts of a bound."""
     shapes: dict[str, tuple[tuple[int, ...], str]] = {
         name: ((boxes, axes) if by_axis else (boxes,), kind)
         for name, (by_axis, kind) in ARRAYS.items()
     }
+    if chance:
+        shapes |= {name: ((boxes,), kind) for name, kind in CHANCE.items()}
     for kinds, count in ((ABOVE, followed), (BOUND, parts)):
         if count is not None:
             sizes = (axes,), (count,)
@@ -91,6 +98,11 @@ class Proof(Frozen):
         assumed. None without a bracket.
     bound
         The lower bound, on 2^``split`` equal parts of every cell; None without a bracket.
+    probability
+        With noise a lower bound of the probability to arrive, from a state drawn from C by volume;
+        None without noise or attractor.
+    chance
+        The same from every box, (B,); None likewise.
     maps
         Its means over what arrives of each cell, and those of ``cost_above``, shape (N,) each; NaN
         where nothing arrives.
@@ -120,6 +132,8 @@ class Proof(Frozen):
     nonnegative: bool | None = None
     bound: Optimum | None = None
     maps: tuple[Floats, Floats] | None = None
+    probability: float | None = None
+    chance: Floats | None = None
 
     @classmethod
     def of(
@@ -155,7 +169,7 @@ class Proof(Frozen):
             share(ARRIVES), share(LOST), share(STAYS), share(UNDECIDED), steps, cost, len(kind),
             seconds, holds, target, witnesses, arrays["cell"], arrays["split"], arrays["place"],
             kind, arrays["level"], arrays["cost"], arrays["lower"], loop.to_stay,
-            above, *bracket,
+            above, *bracket, *_likely(arrays.get("probability"), volume, loop.cells),
         )  # fmt: skip
 
     @property
@@ -170,6 +184,9 @@ class Proof(Frozen):
             self.cost_below,
         )  # fmt: skip
         kinds = {name: kind for name, (_, kind) in ARRAYS.items()}
+        if self.chance is not None:
+            kinds |= CHANCE
+            found += (self.chance,)
         if self.above is not None:
             kinds |= ABOVE
             found += self.above
@@ -202,7 +219,8 @@ class Proof(Frozen):
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
         names = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes", "seconds",
-                 "holds", "witnesses", "followed", "optimum", "nonnegative", "parts")  # fmt: skip
+                 "holds", "witnesses", "followed", "optimum", "nonnegative", "parts",
+                 "probability")  # fmt: skip
         return {name: jsonable(getattr(self, name)) for name in names}
 
     def text(self) -> str:
@@ -217,6 +235,11 @@ class Proof(Frozen):
             lines.append(
                 f"  what arrives does so in at most {self.steps} steps; its average cost lies "
                 f"between {low:.6g} and {high:.6g}"
+            )
+        if self.probability is not None:
+            lines.append(
+                f"  with its noise a run from C arrives with a probability of at least "
+                f"{self.probability:.6g}"
             )
         if self.optimum is not None:
             low, high = self.optimum
@@ -237,6 +260,15 @@ class Proof(Frozen):
         return "\n".join(lines)
 
     __str__ = text
+
+
+def _likely(
+    chance: Floats | None, volume: Floats, cells: int
+) -> tuple[float | None, Floats | None]:
+    """Return the mean probability over C, and that of boxes."""
+    if chance is None:
+        return None, None
+    return math.fsum(chance * volume) / max(cells, 1), chance
 
 
 def _percent(share: float) -> str:

@@ -140,7 +140,7 @@ def _meet_cells(search, image, until, met):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _inside(tree, n, low, high):  # type: ignore[no-untyped-def]
+def inside(tree, n, low, high):  # type: ignore[no-untyped-def]
     """Return whether all of a node lies in a range of places within its cell."""
     for k in range(len(low)):
         shift = BITS - np.int64(tree.split[n, k])
@@ -162,7 +162,7 @@ def _descend(search, root, until, met):  # type: ignore[no-untyped-def]
         n = stack[size]
         state, child = tree.state[n], tree.child[n]
         if (child >= 0) and (
-            state == UNDECIDED or (until == EVERY and not _inside(tree, n, low, high))
+            state == UNDECIDED or (until == EVERY and not inside(tree, n, low, high))
         ):
             if (until == LEAVING) & (search.mark[n] == 0):
                 continue

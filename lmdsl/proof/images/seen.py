@@ -27,8 +27,10 @@ class Seen(NamedTuple):
         Position of the node of each image.
     place
         Places of the images, shape (images, d, 2).
+    more
+        What each image may do besides.
     flags
-        What images may do besides, by node.
+        The same by node.
     dearest, cheapest
         Bounds of the stage cost, by node.
     axis
@@ -37,6 +39,7 @@ class Seen(NamedTuple):
 
     owner: Indices
     place: Indices
+    more: Integers
     flags: Integers
     dearest: Floats
     cheapest: Floats
@@ -60,7 +63,8 @@ class BoxImages:
         self, problem: Problem, partition: Partition, status: Statuses, control: Floats,
         slack: float = 0.0,
     ) -> None:  # fmt: skip
-        self.partition, self.control, self.slack = partition, control, slack
+        self.problem, self.partition = problem, partition
+        self.control, self.slack = control, slack
         self.step = tapes.step(problem)
         self.noise = noise_parts(problem)
         self.axes = np.array(partition.axes, dtype=np.float64)
@@ -93,7 +97,9 @@ class BoxImages:
         count, nodes, d = len(boxes.owner), len(cell), self.partition.dimension
         flags = np.zeros(nodes, dtype=np.uint8)
         dearest, cheapest = np.full(nodes, -np.inf), np.full(nodes, np.inf)
-        held, stretch, located = enclosing.rows(self.step), np.zeros((count, d)), []
+        held, stretch = enclosing.rows(self.step), np.zeros((count, d))
+        located: list[Indices] = []
+        besides: list[Integers] = []
         for least, most in zip(*self.noise, strict=True):
             given = enclosing.Given(
                 boxes.low, boxes.high, self.control[cell[boxes.owner]],
@@ -102,6 +108,7 @@ class BoxImages:
             found = enclosing.enclose(self.step, given, held)
             image, more = self._located(boxes, found)
             located.append(image)
+            besides.append(more)
             np.bitwise_or.at(flags, boxes.owner, more)
             low, high = self._cost(given, found, more)
             np.maximum.at(dearest, boxes.owner, high)
@@ -110,8 +117,8 @@ class BoxImages:
         owner = np.tile(boxes.owner, len(located))
         order = np.argsort(owner, kind="stable")
         axis = self._axis(stretch[:nodes], split)
-        image = np.concatenate(located)[order]
-        return Seen(owner[order], image, flags, dearest, cheapest, axis)
+        image, more = np.concatenate(located)[order], np.concatenate(besides)[order]
+        return Seen(owner[order], image, more, flags, dearest, cheapest, axis)
 
     def _located(self, boxes: Pieces, found: enclosing.Enclosed) -> tuple[Indices, Integers]:
         d = self.partition.dimension

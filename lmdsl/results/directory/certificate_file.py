@@ -78,6 +78,7 @@ class ProofKeys(_Keys):
     optimum: Annotated[tuple[Bound, Bound] | None, BeforeValidator(plain)] = None
     nonnegative: bool | None = None
     parts: Annotated[int, Field(ge=0, lt=2**31)] | None = None
+    probability: float | None = None
 
 
 class CertificateFile(_Keys):

@@ -31,7 +31,17 @@ from lmdsl.results.directory.reading import Reading
 from lmdsl.results.result import Result
 
 NAME = "proof.npz"
-SHARES = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes", "optimum")
+SHARES = (
+    "arrives",
+    "lost",
+    "stays",
+    "undecided",
+    "steps",
+    "cost",
+    "boxes",
+    "optimum",
+    "probability",
+)
 
 
 def prove(
@@ -144,7 +154,8 @@ def _policy(files: Reading, result: Result) -> dict[str, NDArray[Any]]:
 
 def read(path: str | os.PathLike[str], result: Result, said: ProofKeys) -> dict[str, NDArray[Any]]:
     """Read the boxes of a proof."""
-    shapes = expected(said.boxes, result.partition.dimension, said.followed, said.parts)
+    shapes = expected(said.boxes, result.partition.dimension, said.followed, said.parts,
+                      said.probability is not None)  # fmt: skip
     each = BOX + 5 * result.partition.dimension
     more = 24 * (said.followed or 0) + 8 * (said.parts or 0)
     memory.require(2.0 * each * said.boxes + more, "the boxes of the proof")
