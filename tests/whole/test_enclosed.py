@@ -41,7 +41,12 @@ def winning(data, status):
             out = ((a <= 0) | (b >= cells[:, None])).any(axis=0)
             ends = (np.clip(np.floor(x), 0, cells[:, None] - 1).astype(int) for x in (a, b))
             posts.append((*ends, out))
-    won = target.copy()
+    return surely(posts, target, unsafe, cells)
+
+
+def surely(posts, target, unsafe, cells):
+    """Return the cells outside A from which A is reached, by what cells may meet; flat."""
+    won, shape = target.copy(), target.shape
     while True:
         sums = np.zeros(cells + 1, dtype=int)
         sums[1:, 1:, 1:] = (~won).cumsum(0).cumsum(1).cumsum(2)
@@ -104,8 +109,12 @@ def test_published_problems(name, sure, kept):
     print(f"{name}: C {result.stabilizable_cells}, sure {result.sure_cells}, won {won.sum()}")
 
 
-def test_safety_of_the_boost_converter():
-    """The published regulation of a DC-DC converter, killed at random; here 80 x 80 cells."""
+@pytest.mark.parametrize(
+    ("cells", "kill", "runs"),
+    [(80, 0.01, 20_000), pytest.param(799, 0.01, 100_000, marks=pytest.mark.long)],
+)
+def test_safety_of_the_boost_converter(cells, kill, runs):
+    """The published safety of a DC-DC converter, killed at random; 80 x 80 of its 799 x 799 cells."""
     linear = {
         1: ("0.9917012926388759*i + 0.16597414722248083", "0.9929178767321044*v"),
         2: ("0.9902950292942829*i - 0.032892318823717294*v + 0.16587291875265632",
@@ -116,13 +125,13 @@ def test_safety_of_the_boost_converter():
         "format": "lmdsl/1",
         "let": {"j": i},
         "system": {"kind": "map", "next": {
-            "i": "where(kill == 1, 1.1475, where(j < 1.15, 99, j))",
+            "i": f"where(kill == 1, {1.15 - 0.2 / cells!r}, where(j < 1.15, 99, j))",
             "v": f"where(kill == 1, 5.65, {v})"}},
-        "state_box": {"i": {"low": 1.145, "high": 1.55, "cells": 81},
-                      "v": {"low": 5.45, "high": 5.85, "cells": 80}},
-        "attractor": {"boxes": [{"i": [1.145, 1.15]}]},
+        "state_box": {"i": {"low": 1.15 - 0.4 / cells, "high": 1.55, "cells": cells + 1},
+                      "v": {"low": 5.45, "high": 5.85, "cells": cells}},
+        "attractor": {"boxes": [{"i": [1.15 - 0.4 / cells, 1.15]}]},
         "control_grid": {"mode": {"values": [1, 2]}},
-        "noise": {"kill": {"values": [0, 1], "weights": [0.99, 0.01]}},
+        "noise": {"kill": {"values": [0, 1], "weights": [1 - kill, kill]}},
         "stage_cost": "1",
         "sampling": {"kind": "grid", "per_axis": 2},
         "successors": "enclosed",
@@ -130,4 +139,103 @@ def test_safety_of_the_boost_converter():
     assert result.verified
     assert result.claims["safe"]
     assert result.sure_cells == 0  # nothing but chance ends a run
-    assert result.simulate(20_000, 3_000, as_compiled=True).lost == 0
+    assert result.simulate(runs, 3_000, as_compiled=True).lost == 0
+
+
+# An aircraft that lands: sink rate and angle as it touches down, published with SCOTS --------------
+
+AIRCRAFT = {
+    "format": "lmdsl/1",
+    "system": {"kind": "ode", "parameters": {"mg": 588600.0, "mi": 1.6666666666666667e-05},
+               "derivative": {
+                   "V": "mi*(T*cos(al) - (2.7 + 3.08*(1.25 + 4.2*al)**2)*V**2 - mg*sin(g))",
+                   "g": "(1/(60000*V))*(T*sin(al) + 68.6*(1.25 + 4.2*al)*V**2 - mg*cos(g))",
+                   "h": "V*sin(g)"},
+               "step": 0.25, "substeps": 1, "judged": "endpoint"},
+    "state_box": {"V": {"low": 58, "high": 83, "cells": 91},
+                  "g": {"low": -0.05235987755982989, "high": 0, "cells": 33},
+                  "h": {"low": 0, "high": 56, "cells": 84}},
+    "attractor": {"where": "V >= 63 and V <= 75 and h <= 2.5 and V*sin(g) >= -0.91"},
+    "control_grid": {"T": {"values": [0, 32000]},
+                     "al": {"low": 0, "high": 0.13744467859455345, "points": 8}},
+    "stage_cost": "0.25",
+    "sampling": {"kind": "grid", "per_axis": 2},
+    "successors": "enclosed",
+}  # fmt: skip
+
+
+def landing(low, high):
+    """The cells low..high-1 of the published grid, on each axis."""
+    box = {}
+    for (name, axis), a, b in zip(AIRCRAFT["state_box"].items(), low, high, strict=True):
+        width = (axis["high"] - axis["low"]) / axis["cells"]
+        ends = [axis["low"] + a * width, axis["low"] + b * width]
+        box[name] = {"low": ends[0], "high": ends[1], "cells": b - a}
+    return {**AIRCRAFT, "state_box": box}
+
+
+def won_by_growth(data, status):
+    """The published growth bound, its matrix for every control."""
+    boxes = list(data["state_box"].values())
+    low, high = (np.array([box[end] for box in boxes]) for end in ("low", "high"))
+    cells = np.array([box["cells"] for box in boxes])
+    width, shape = (high - low) / cells, tuple(cells)
+    centre = [low[k] + (np.arange(n) + 0.5) * width[k] for k, n in enumerate(cells)]
+    mesh = np.stack([x.ravel() for x in np.meshgrid(*centre, indexing="ij")])
+    posts, (mg, mi) = [], AIRCRAFT["system"]["parameters"].values()
+    for T, al in np.ndindex(2, 8):
+        T, al = 32_000 * T, al * 0.13744467859455345 / 7
+        lift, drag = 68.6 * (1.25 + 4.2 * al), 2.7 + 3.08 * (1.25 + 4.2 * al) ** 2
+        L = np.array([[-0.00191 * drag, 9.81, 0], [0.002933 + 0.004802 * al, 0.003623, 0],
+                      [0.07483, 83.22, 0]])  # fmt: skip
+
+        def rate(x, T=T, al=al, lift=lift, drag=drag):
+            V, g, _ = x
+            return np.array([
+                mi * (T * np.cos(al) - drag * V**2 - mg * np.sin(g)),
+                (T * np.sin(al) + lift * V**2 - mg * np.cos(g)) / (60_000 * V),
+                V * np.sin(g),
+            ])  # fmt: skip
+
+        end, radius = stepped(rate, mesh), stepped(lambda r, L=L: L @ r, width / 2)[:, None]
+        a, b = ((end + sign * radius - low[:, None]) / width[:, None] for sign in (-1, 1))
+        first, last = np.floor(a + 1e-9), np.ceil(b - 1e-9) - 1
+        out = ((first < 0) | (last >= cells[:, None])).any(axis=0)
+        ends = (np.clip(x, 0, cells[:, None] - 1).astype(int) for x in (first, last))
+        posts.append((*ends, out))
+    target, unsafe = (status == 0).reshape(shape), (status == 5).reshape(shape)
+    return surely(posts, target, unsafe, cells)
+
+
+def stepped(rate, x, h=0.25):
+    """A step of the classical Runge-Kutta method."""
+    k1 = rate(x)
+    k2 = rate(x + h / 2 * k1)
+    k3 = rate(x + h / 2 * k2)
+    k4 = rate(x + h * k3)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [((17, 20, 0), (62, 33, 8)), pytest.param(((0, 0, 0), (91, 33, 84)), marks=pytest.mark.long)],
+)
+def test_an_aircraft_lands_from_where_a_growth_bound_lands_it(part):
+    data = landing(*part)
+    result = lm.solve(made(data))
+    assert result.verified
+    assert result.claims["safe"]
+    won = won_by_growth(data, result.cell_status)
+    assert won.sum() > 100
+    assert not (won & (result.sure_levels <= 0)).any()
+    runs = result.simulate(100_000, 1_000, as_compiled=True)
+    assert (runs.lost, runs.reached) == (0, 100_000)
+    print(f"sure {result.sure_cells}, growth bound {won.sum()}")
+
+
+@pytest.mark.long
+def test_an_aircraft_lands_along_its_path():
+    data = landing((0, 0, 0), (91, 33, 84))
+    result = lm.solve(made({**data, "system": {**data["system"], "judged": "path"}}))
+    assert result.verified
+    assert result.simulate(100_000, 1_000, as_compiled=True).lost == 0
