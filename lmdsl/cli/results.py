@@ -96,11 +96,13 @@ def _prove(parsed: Arguments) -> int:
 
 def _plot(parsed: Arguments) -> int:
     from lmdsl import plotting
-    from lmdsl.results.result import Result
+    from lmdsl.results.directory import archive, proved
 
-    result = Result.load(parsed.dir)
+    stored = archive.read(parsed.dir)
+    result = stored.result
+    proof = proved.as_stored(parsed.dir, result, stored.certificate.proof)
     path = Path(parsed.out) if parsed.out is not None else Path(parsed.dir) / "figures.png"
-    plotting.figure(result, path)
+    plotting.figure(result, path, proof=proof)
     say(f"written to {printable(str(path))} ({AS_STORED})")
     return 0
 

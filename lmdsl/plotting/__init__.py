@@ -4,5 +4,9 @@ from lmdsl.plotting.brackets import bracket
 from lmdsl.plotting.closed_loop import trajectories
 from lmdsl.plotting.page import figure
 from lmdsl.plotting.plots import causes, control, cost, measure, portrait
+from lmdsl.plotting.proofs import proof
 
-__all__ = ["bracket", "causes", "control", "cost", "figure", "measure", "portrait", "trajectories"]
+__all__ = [
+    "bracket", "causes", "control", "cost", "figure", "measure", "portrait", "proof",
+    "trajectories",
+]  # fmt: skip

@@ -296,11 +296,15 @@ def _steps(ax: Any, view: View, values: Floats, label: str) -> None:
 
 
 def image(ax: Any, view: View, values: Floats, colours: Any) -> Any:
-    """Draw values (in the view's shape) as an image in the coordinates of the states."""
+    """Draw values (in the view's shape) as an image in the coordinates of the states.
+
+    Those over one axis have a second one of any length, and fill the height from 0 to 1.
+    """
+    upwards = view.ends(1) if len(view.axes) == 2 else (0.0, 1.0)
     return ax.imshow(
         np.ma.masked_invalid(values).T,
         origin="lower",
-        extent=(*view.ends(0), *view.ends(1)),
+        extent=(*view.ends(0), *upwards),
         aspect="auto",
         interpolation="nearest",
         cmap=colours,

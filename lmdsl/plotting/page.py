@@ -13,10 +13,11 @@ from lmdsl.common.files import write_whole
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.plotting import layers, overlays
+from lmdsl.plotting import layers, overlays, proofs
 from lmdsl.plotting.closed_loop import trajectories
 from lmdsl.plotting.plots import _bytes, _view, control, cost, measure, portrait
 from lmdsl.plotting.view import At, number, plain
+from lmdsl.proof.record import Proof
 from lmdsl.results.result import Result
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ def figure(
     axes: Sequence[str] | None = None,
     at: At | None = None,
     seed: int = 0,
+    proof: Proof | None = None,
 ) -> Figure:
     """Draw one page with everything: portrait, cost, controls, measure, runs and the numbers.
 
@@ -50,6 +52,8 @@ def figure(
         Which axes are shown and where the others are held.
     seed
         Seed of the closed-loop runs.
+    proof
+        What :meth:`Result.prove` returned: then it is drawn, too.
 
     Returns
     -------
@@ -75,6 +79,8 @@ def figure(
             draw.append(lambda ax, name=name: control(result, name, ax, axes=axes, at=at))
         draw.append(lambda ax: measure(result, ax, axes=axes, at=at))
         draw.append(lambda ax: trajectories(result, ax, seed=seed, axes=axes, at=at))
+    if proof is not None:
+        draw.append(lambda ax: proofs.proof(result, proof, ax, axes=axes, at=at))
     draw.append(lambda ax: _numbers(ax, result))
     memory.require(_bytes(view, 300 + 60 * len(draw)) + PAGE, "plots")
     columns = min(len(draw), 3)

@@ -54,7 +54,7 @@ def faults(loop: Loop, arrays: Arrays, guard: Guard, entry: Bools | None = None)
     images = loop.images()
     each = node_bytes(partition.dimension, len(images.noise[0]))
     memory.require(each * (2.0 * count + partition.size), "the boxes of the proof")
-    wrong = _malformed(loop, arrays)
+    wrong = malformed(loop, arrays)
     if wrong:
         return [wrong]
     cover = Cover(partition, loop.status)
@@ -88,7 +88,8 @@ def faults(loop: Loop, arrays: Arrays, guard: Guard, entry: Bools | None = None)
     ]
 
 
-def _malformed(loop: Loop, arrays: Arrays) -> str:
+def malformed(loop: Loop, arrays: Arrays) -> str:
+    """Return why arrays cannot be those of a proof, if they cannot."""
     cell, split, place = arrays["cell"], arrays["split"], arrays["place"]
     sound = (
         (np.diff(cell) >= 0).all()

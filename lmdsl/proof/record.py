@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -15,6 +15,7 @@ from lmdsl.proof.bounds.optimum.averages import Bracket, mean, means, volumes
 from lmdsl.proof.bounds.optimum.bracket import Optimum
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
+from lmdsl.proof.whereabouts import Whereabouts
 
 _WITNESSES = {
     "lost": "runs are lost", "stays": "runs stay elsewhere", "undecided": "it is undecided",
@@ -103,6 +104,8 @@ class Proof(Frozen):
         None without noise or attractor.
     chance
         The same from every box, (B,); None likewise.
+    where
+        Of what is ``lost``, ``stays`` or is ``undecided`` the fewest cells that hold half of it.
     maps
         Its means over what arrives of each cell, and those of ``cost_above``, shape (N,) each; NaN
         where nothing arrives.
@@ -134,6 +137,7 @@ class Proof(Frozen):
     maps: tuple[Floats, Floats] | None = None
     probability: float | None = None
     chance: Floats | None = None
+    where: dict[str, Whereabouts | None] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -170,6 +174,10 @@ class Proof(Frozen):
             seconds, holds, target, witnesses, arrays["cell"], arrays["split"], arrays["place"],
             kind, arrays["level"], arrays["cost"], arrays["lower"], loop.to_stay,
             above, *bracket, *_likely(arrays.get("probability"), volume, loop.cells),
+            {
+                name: Whereabouts.of(loop.partition, arrays["cell"], volume, kind == state)
+                for name, state in (("lost", LOST), ("stays", STAYS), ("undecided", UNDECIDED))
+            },
         )  # fmt: skip
 
     @property
@@ -220,7 +228,7 @@ class Proof(Frozen):
         """Return plain data for JSON."""
         names = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes", "seconds",
                  "holds", "witnesses", "followed", "optimum", "nonnegative", "parts",
-                 "probability")  # fmt: skip
+                 "probability", "where")  # fmt: skip
         return {name: jsonable(getattr(self, name)) for name in names}
 
     def text(self) -> str:
@@ -250,6 +258,7 @@ class Proof(Frozen):
             )
         lines += [
             f"  {words}, for example from ({', '.join(f'{x:.9g}' for x in found)})"
+            + (f"; {self.where[name]}" if self.where.get(name) else "")
             for name, words in _WITNESSES.items()
             if (found := self.witnesses[name]) is not None
         ]

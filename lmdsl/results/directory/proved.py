@@ -166,6 +166,20 @@ def read(path: str | os.PathLike[str], result: Result, said: ProofKeys) -> dict[
     return reading.read(writing.place(path), boxes)
 
 
+def as_stored(path: str | os.PathLike[str], result: Result, said: ProofKeys | None) -> Proof | None:
+    """Return the proof of a directory without its bounds on parts, unchecked; None without one.
+
+    BadInput: it cannot be read.
+    """
+    if said is None:
+        return None
+    found, loop = read(path, result, said), loop_of(result)
+    wrong = checking.malformed(loop, found)
+    if wrong:
+        raise BadInput(wrong.removeprefix(f"{NAME}: "), NAME)
+    return Proof.of(found, loop, seconds=said.seconds, holds=said.holds, target=said.target)
+
+
 def note(said: ProofKeys) -> str:
     """Return one line on a proof that holds."""
     return (
