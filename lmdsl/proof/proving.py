@@ -73,7 +73,7 @@ def prove(
     kept = holds(entered(prover.cover, ends, loop.attractor))
     del prover
     above = refine(flights, arrays, deadline, progress) if bounded else None
-    bound = best(loop, _most(arrays), whole, progress, SLACK) if bracket else None
+    bound = best(loop, *_most(arrays, partition.size), whole, progress, SLACK) if bracket else None
     seconds = time.monotonic() - began
     return Proof.of(
         arrays, loop, seconds=seconds, holds=kept, target=target, above=above, bound=bound
@@ -119,10 +119,16 @@ def _decided(prover: Prover) -> tuple[Indices, Statuses, NDArray[np.int32]]:
     return tree.cell[leaves].astype(np.int64), tree.state[leaves], tree.level[leaves]
 
 
-def _most(arrays: dict[str, NDArray[Any]]) -> float:
-    """Return more than any upper bound of boxes that arrive: larger lower bounds are of no use."""
-    cost = arrays["cost"][arrays["class"] == ARRIVES]
-    return 2.0 * float(cost[np.isfinite(cost)].max(initial=1.0))
+def _most(arrays: dict[str, NDArray[Any]], N: int) -> tuple[float, Indices]:
+    """Return more than any upper bound of boxes that arrive: larger lower bounds are of no use.
+
+    And the cells, those from which the cost may be least first.
+    """
+    arrives = arrays["class"] == ARRIVES
+    cost, first = arrays["cost"][arrives], np.full(N, np.inf)
+    np.minimum.at(first, arrays["cell"][arrives], cost)
+    most = 2.0 * float(cost[np.isfinite(cost)].max(initial=1.0))
+    return most, np.argsort(first, kind="stable")
 
 
 def boxes(prover: Prover, chance: Floats | None = None) -> dict[str, NDArray[Any]]:

@@ -38,9 +38,10 @@ def loop_for(data):
 def bounded(data, rows=2**12, most=1e3, loop=None):
     """The bound on as many parts as so many rows allow, and its loop."""
     loop = loop_for(data) if loop is None else loop
+    cells = np.arange(loop.partition.size)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bracket, "FEW", rows)
-        return bracket.bound(loop, most, Deadline(), None, 2.0**-36), loop
+        return bracket.bound(loop, most, cells, Deadline(), None, 2.0**-36), loop
 
 
 def at(bound, loop, x):
@@ -308,7 +309,7 @@ def test_time_that_is_too_short_leaves_a_bound():
     result = lm.solve(made(PLANE))
     proof = result.prove(0.9, 1e-6, bracket=True)
     assert proof.optimum is None or proof.optimum[0] >= 0
-    bound = bracket.bound(loop_of(result), 10.0, Deadline(1e-9), None, 0.0)
+    bound = bracket.bound(loop_of(result), 10.0, np.arange(36), Deadline(1e-9), None, 0.0)
     assert checked(bound, loop_of(result)) == []
 
 

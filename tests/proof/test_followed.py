@@ -150,6 +150,22 @@ def test_a_time_limit_ends_it():
     assert above is None or checking.fault(flights, proof.arrays(), above, lambda: None) < 0
 
 
+@settings(max_examples=8, deadline=None)
+@given(st.tuples(*[st.floats(-0.9, 0.9) for _ in range(4)]), st.sampled_from([0.7, 1.0, 1.3]))
+def test_random_maps(matrix, gamma):
+    """Bounds hold of random states of what arrives, and follow when they are checked."""
+    a, b, c, d = (round(x, 3) for x in matrix)
+    x, y = f"({a})*x + ({b})*y + 0.2*sin(3*y)*u", f"({c})*x + ({d})*y + u"
+    data = {**PLANE, "gamma": gamma, "system": {"kind": "map", "next": {"x": x, "y": y}}}
+    if not (lm.solve(made(data)).control_index >= 0).any():
+        return
+    result, proof = proved(data, target=0.5, few=2**11)
+    assert exceptions(result, proof, 500) == {"arrives": 0, "lost": 0, "stays": 0}
+    if proof.followed is not None:
+        _, reasons = checking.checked_above(loop_of(result), proof.arrays(), lambda: None)
+        assert reasons == []
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6))
 def test_sets_hold_the_images_of_their_points(seed):

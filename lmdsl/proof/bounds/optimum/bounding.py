@@ -17,6 +17,8 @@ from lmdsl.proof.bounds.optimum.moves import Game, Moves, Parts
 SLACK = 2.0**-40  # by how much bounds are lowered, relative: see settling.py
 MOST_MET = 2**16  # parts above which a range counts as all parts
 CLOSE = 1e-4  # relative rise a sweep below which a bound from below is good enough
+# Sweeps at most: from below each is a bound, and small costs make it rise slowly.
+FROM_BELOW, FROM_ABOVE = 500, 10_000
 SWEEPS = 30  # after which a bound that has to be lowered still is given up
 AT_A_TIME = 2**12  # parts that a thread sweeps at a time
 
@@ -68,13 +70,14 @@ def settle(sweep: Sweep, W: Floats, order: Indices, guard: Guard, above: bool) -
     """
     step = -1 if above else 1
     free = order[sweep.free[order]]
-    while True:
+    for _ in range(FROM_ABOVE if above else FROM_BELOW):
         guard()
         parts = [free[i : i + AT_A_TIME] for i in range(0, len(free), AT_A_TIME)]
         one = partial(lower, sweep, W, float(W.min(initial=np.inf)), step)
         change = threads.each(one, parts)
         if max(change, default=0.0) <= (0.0 if above else CLOSE):
             return True
+    return not above
 
 
 def consistent(sweep: Sweep, W: Floats, order: Indices) -> bool:

@@ -38,17 +38,18 @@ class Optimum(NamedTuple):
 
 
 def bound(
-    loop: Loop, most: float, deadline: Deadline, progress: Progress | None, slack: float
-) -> Optimum:
+    loop: Loop, most: float, order: Indices, deadline: Deadline, progress: Progress | None,
+    slack: float,
+) -> Optimum:  # fmt: skip
     """Return the best bound that the time allows.
 
-    ``most`` is the largest value of use, ``slack`` by how much images are widened, in cells.
+    ``most`` is the largest value of use, ``slack`` by how much images are widened, in cells, and
+    ``order`` that in which cells are best looked at.
     """
     game, d = loop.game(slack), loop.partition.dimension
     split = np.zeros(d, dtype=np.int64)
     grid = Parts.of(loop.partition, split)
     known = Optimum(split.astype(np.uint8), ends(game, grid), not game.negative)
-    order = np.arange(grid.size)
     while True:
         began = time.monotonic()
         W = _bounded(game, grid, (known, order), most, deadline)
@@ -96,7 +97,8 @@ def _bounded(
         W = ends(game, grid)
         W[sweep.free] = most if above else carried(game, known, grid)[sweep.free]
         try:
-            settle(sweep, W, order, guard, above)
+            if not settle(sweep, W, order, guard, above):
+                return None
         except Stopped:
             if above:
                 return None
