@@ -13,7 +13,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.proof.bounds.chance import chances
 from lmdsl.proof.bounds.flights.following import Flights
 from lmdsl.proof.bounds.flights.refining import SLACK as RAISED
-from lmdsl.proof.bounds.flights.refining import refine
+from lmdsl.proof.bounds.flights.refining import close, refine
 from lmdsl.proof.bounds.optimum.bracket import bound as best
 from lmdsl.proof.bounds.tightening import arriving, tighten
 from lmdsl.proof.cover import Cover, node_bytes
@@ -72,7 +72,8 @@ def prove(
     ends = leaves[prover.cover.tree.state[leaves] == ARRIVES]
     kept = holds(entered(prover.cover, ends, loop.attractor))
     del prover
-    above = refine(flights, arrays, deadline, progress) if bounded else None
+    followed = bounded and flights.able and not close(arrays)
+    above = refine(flights, arrays, deadline, progress) if followed else None
     bound = best(loop, *_most(arrays, partition.size), whole, progress, SLACK) if bracket else None
     seconds = time.monotonic() - began
     return Proof.of(

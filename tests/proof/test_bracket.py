@@ -16,6 +16,7 @@ import lmdsl as lm
 from lmdsl.cli import main
 from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import proving
+from lmdsl.proof.bounds.flights import refining
 from lmdsl.proof.bounds.optimum import bracket, checking
 from lmdsl.proof.bounds.optimum.moves import Parts
 from lmdsl.results.directory.proved import loop_of
@@ -334,16 +335,17 @@ def test_maps_are_drawn(monkeypatch):
         lm.plotting.bracket(lm.solve(made(walk())), proof)
 
 
-def test_the_benchmark_runs(capsys, monkeypatch, tmp_path):
+def test_the_benchmark_runs(monkeypatch, tmp_path):
     """The bracket of the standard map on few cells: bounds on both sides of what runs cost."""
     pytest.importorskip("matplotlib")
     from benchmarks import bracket as benchmark
 
     monkeypatch.setattr(benchmark, "RUNS", 2_000)
     monkeypatch.setattr(bracket, "FEW", 2**14)
-    few_boxes(monkeypatch)
-    row, result, proof = benchmark.measured(20, None, 0.5)
+    monkeypatch.setattr(refining, "FEW", 2**12)
+    found = benchmark.measured(20, None)
+    row = found.row
     assert 0 < row.below < row.mean * 1.05
     assert row.mean < row.above * 1.05
-    benchmark.drawn([row], result, proof, tmp_path / "bracket.png")
+    benchmark.drawn([found], tmp_path / "bracket.png")
     assert (tmp_path / "bracket.png").stat().st_size > 10_000

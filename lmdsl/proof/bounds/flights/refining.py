@@ -50,10 +50,8 @@ class Above(NamedTuple):
 def refine(
     flights: Flights, boxes: Arrays, deadline: Deadline, progress: Progress | None
 ) -> Above | None:
-    """Return bounds on parts as fine as time and memory allow; None where none are needed."""
+    """Return bounds on parts as fine as time and memory allow; None where there is no time."""
     loop = flights.loop
-    if not flights.able or _close(boxes):
-        return None
     found, todo, last = None, np.zeros(0, dtype=np.bool_), 0.0
     split = np.zeros(loop.partition.dimension, dtype=np.int64)
     while True:
@@ -91,7 +89,7 @@ def _again(flights: Flights, found: Above, todo: Bools, deadline: Deadline, last
     return found
 
 
-def _close(boxes: Arrays) -> bool:
+def close(boxes: Arrays) -> bool:
     """Return whether the bounds of boxes are close, or there is nothing to bound."""
     arrives = boxes["class"] == ARRIVES
     weight = volumes(boxes["split"][arrives])
