@@ -212,7 +212,7 @@ def test_simulations_hold(local):
     assert runs.held.returned == runs.held.away == runs.held.lost == 0
     if local is HOLD:
         assert runs.held.stayed == 300
-        assert result.prove(0.5, time_limit=20).holds
+        assert result.prove(0.5, time_limit=4).holds
 
 
 def test_only_the_end_of_a_step_enters_the_attractor():

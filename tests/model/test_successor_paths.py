@@ -67,17 +67,17 @@ def test_surely_absorbed_on_the_way_may_end_anywhere():
 
 
 def test_a_wrong_control_is_refused():
-    """Every control of every cell is judged anew as compiling judged it, or found better."""
+    """Every control of every fourth cell is judged anew as compiling judged it, or found better."""
     lp = lm.compile(WALLS)
     assert safety.kept(lp, policy_of(lp, lm.solve(lp))).all()
     sets, allowed = CellSets.of(WALLS, lp.partition), np.isin(lp.cell_status, (0, 1))
     judge = Inclusion(WALLS, lp.partition, sets, allowed)
     rng, late = np.random.default_rng(2), np.linspace(0, 1, 41)[1:]
     refused = 0
-    for i, cell in enumerate(lp.cells):
+    for i, cell in list(enumerate(lp.cells))[::4]:
         surviving = lp.control[lp.pair_pointer[i] : lp.pair_pointer[i + 1]]
-        for control in range(len(lp.controls)):
-            proved = judge(np.array([cell]), np.array([control])).item()
+        every = np.arange(len(lp.controls))
+        for control, proved in enumerate(judge(np.full(len(every), cell), every)):
             assert proved or control not in surviving
             refused += not proved
             x = states_of(lp.partition, cell, 20, rng)
@@ -87,7 +87,7 @@ def test_a_wrong_control_is_refused():
             entered = np.cumsum(sets.attractor[places] & (places >= 0), axis=0) > 0
             lost = (((places < 0) | sets.avoid[places]) & ~entered).any()
             assert not (proved and lost)
-    assert refused > 100
+    assert refused > 40
 
 
 def test_only_where_it_is_judged_a_path_is_absorbed():

@@ -24,6 +24,10 @@ TARGETS = {"standard_map": 0.4, "logistic_map": 1.0, "henon_map": 0.95, "double_
            "lorenz": 0.005}  # fmt: skip
 
 
+# One process has the proof of a system.
+SYSTEMS = [pytest.param(name, marks=pytest.mark.xdist_group(name)) for name in NAMED]
+
+
 @functools.cache
 def proved(name):
     return solved(name), solved(name).prove(TARGETS[name])
@@ -33,14 +37,14 @@ def test_every_system_is_proved():
     assert TARGETS.keys() == NAMED.keys()
 
 
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_random_states_do_what_is_proved_of_their_boxes(name):
     result, proof = proved(name)
     assert proof.reached
     assert exceptions(result, proof, 20_000) == {"arrives": 0, "lost": 0, "stays": 0}
 
 
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_states_at_the_faces_of_boxes_too(name):
     """Corners, and what lies a rounding or less than the width of an edge away from them."""
     result, proof = proved(name)
@@ -58,13 +62,13 @@ def test_states_at_the_faces_of_boxes_too(name):
     assert found == {"arrives": 0, "lost": 0, "stays": 0}
 
 
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_the_check_confirms_the_proof(name):
     result, proof = proved(name)
     assert faults(loop_of(result), proof.arrays(), lambda: None) == []
 
 
-@pytest.mark.parametrize("name", NAMED)
+@pytest.mark.parametrize("name", SYSTEMS)
 def test_the_mean_cost_lies_between_its_bounds(name):
     result, proof = proved(name)
     rng = np.random.default_rng(5)

@@ -14,8 +14,8 @@ import lmdsl as lm
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory):
-    """An exported certificate of the standard map on 20 x 20 cells, as parsed lines."""
-    path = exported(lm.solve(made(standard_map(20))), tmp_path_factory.mktemp("export"))
+    """An exported certificate of the standard map on 12 x 12 cells, as parsed lines."""
+    path = exported(lm.solve(made(standard_map(12))), tmp_path_factory.mktemp("export"))
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
@@ -56,7 +56,7 @@ def scale(entry, key, factor):
         ("mu", -1, 4),
     ],
 )
-@pytest.mark.parametrize("i", [0, 17, 391])
+@pytest.mark.parametrize("i", [0, 17, 131])
 def test_spoiled_vectors_are_refused(spoil, name, factor, claim, i):
     status, said = spoil(lambda head, cells, pairs: scale(cells[i], name, factor))
     assert status == 1
@@ -106,7 +106,7 @@ def test_a_spoiled_policy_is_refused(spoil, original):
         wrong = int(rng.choice(others))
         status, said = spoil(lambda head, cells, pairs, i=i, a=wrong: cells[i].update(policy=a))
         assert status == 1
-        assert fails(said, 4)
+        assert fails(said, 2) or fails(said, 4)
     assert spoil(lambda head, cells, pairs: cells[5].update(policy=10**6))[0] == 2
 
 
@@ -114,7 +114,7 @@ def of_the_policy(cells, pairs, i):
     return next(pair for pair in pairs if pair[:2] == [i, cells[i]["policy"]])
 
 
-@pytest.mark.parametrize("i", [0, 17, 391])
+@pytest.mark.parametrize("i", [0, 17, 131])
 @pytest.mark.parametrize(("factor", "claim"), [(1 + 1e-6, 2), (1 - 1e-6, 3)])
 def test_a_spoiled_cost_is_refused(spoil, i, factor, claim):
     def change(head, cells, pairs):
@@ -128,7 +128,7 @@ def test_a_spoiled_cost_is_refused(spoil, i, factor, claim):
         assert spoil(lambda h, cells, pairs, c=cost: pairs[7].__setitem__(2, c))[0] == 2
 
 
-@pytest.mark.parametrize("i", [0, 17, 391])
+@pytest.mark.parametrize("i", [0, 17, 131])
 def test_a_spoiled_row_is_refused(spoil, i):
     def numerator(head, cells, pairs):
         of_the_policy(cells, pairs, i)[3][0][1] += 1
