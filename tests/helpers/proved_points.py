@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 import time
 
@@ -75,12 +76,17 @@ def exceptions(result, proof, count, seed=0, x=None, box=None):
 
 
 def above_at(proof, partition, x):
-    """The upper bound of the part of each state; states are not at faces of parts."""
+    """The upper bound of the part of each state; at faces the largest of the parts that meet."""
     split = proof.above.split.astype(int)
     shape = partition.cells << split
-    t = (x - partition.low) / (partition.high - partition.low)
-    index = np.clip((t * shape).astype(int), 0, shape - 1)
-    return proof.above.bound.reshape(tuple(shape))[tuple(index.T)].astype(float)
+    bound = proof.above.bound.reshape(tuple(shape))
+    most = np.full(len(x), -np.inf)
+    for sides in itertools.product((-2e-9, 2e-9), repeat=partition.dimension):
+        t = ((x - partition.low) / partition.width + sides) / partition.cells
+        t = np.where(partition.periodic, t % 1.0, np.clip(t, 0.0, 1.0))
+        index = np.minimum((t * shape).astype(int), shape - 1)
+        most = np.maximum(most, bound[tuple(index.T)])
+    return most.astype(float)
 
 
 def proof_of(path):
