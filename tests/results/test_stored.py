@@ -16,7 +16,7 @@ from saved_results import put, refused
 
 import lmdsl as lm
 from lmdsl.cli import main
-from lmdsl.results.directory import audit, reading
+from lmdsl.results.directory import functions, reading
 from lmdsl.results.directory.certificate_file import CertificateFile
 from lmdsl.results.summary import Summary
 from lmdsl.systems import FunctionSystem
@@ -319,13 +319,13 @@ def test_a_terminal_cost_of_a_function(tmp_path, discount):
     found = lm.verify(out)
     assert found.holds
     assert "the terminal cost was not checked" in found.notes[1]
-    cost, entering = result.lp.cost, audit._entering(result.lp)
+    cost, entering = result.lp.cost, functions._entering(result.lp)
     assert 0 < entering.sum() < len(entering)
     for k in range(len(cost)):
         for more in (0.5, -3):
             changed = cost.copy()
             changed[k] += more
-            text = str(audit.function_differences(replace(result.lp, cost=changed), result))
+            text = str(functions.function_differences(replace(result.lp, cost=changed), result))
             unseen = entering[k] and more > 0
             assert ("is not the stage cost" in text) != unseen
 
