@@ -233,9 +233,11 @@ class Proof(Frozen):
 
     def text(self) -> str:
         """Return what is proved for people."""
+        lost, stays = f"{_percent(self.lost)} to be lost", f"{_percent(self.stays)} to stay"
+        what = f"to arrive, {lost}, {stays} elsewhere" if not self.to_stay else f"to stay, {lost}"
+        share = self.stays if self.to_stay else self.arrives
         lines = [
-            f"of the volume of C {_percent(self.arrives)} is proved to arrive, "
-            f"{_percent(self.lost)} to be lost, {_percent(self.stays)} to stay elsewhere; "
+            f"of the volume of C {_percent(share)} is proved {what}; "
             f"{_percent(self.undecided)} is undecided"
         ]
         if self.cost is not None:
@@ -261,9 +263,11 @@ class Proof(Frozen):
             + (f"; {self.where[name]}" if self.where.get(name) else "")
             for name, words in _WITNESSES.items()
             if (found := self.witnesses[name]) is not None
+            and not (name == "stays" and self.to_stay)
         ]
         held = {True: "proved", False: "refuted by a run", None: "not proved"}[self.holds]
-        lines.append(f"  that what arrives stays in A is {held}")
+        if not self.to_stay:
+            lines.append(f"  that what arrives stays in A is {held}")
         lines.append(f"  {self.boxes:,} boxes, {self.seconds:.1f} s; target {self.target:.6g} is "
                      f"{'reached' if self.reached else 'not reached'}")  # fmt: skip
         return "\n".join(lines)

@@ -219,6 +219,11 @@ def test_without_an_attractor_staying_is_the_target():
     assert proof.stays == 1
     assert proof.arrives == 0
     assert proof.reached
+    assert str(proof).startswith(
+        "of the volume of C 100.0000 % is proved to stay, 0.0000 % to be lost"
+    )
+    assert "elsewhere" not in str(proof)
+    assert "stays in A" not in str(proof)
 
 
 def test_the_cost_of_a_killed_chain_counts_the_discount():
