@@ -2,7 +2,8 @@
 
 Pairs of which a state loses the run, whatever is done afterwards, are dropped beforehand: all of
 them where enough of C can be kept without, else those that lose more than others of their cell.
-A round proves what becomes of C under the controller. If after a moment there are pairs at which a
+A round solves, and drops pairs of the controller of which one of many more states is lost, until
+there is none. Then it proves what becomes of C. If after a moment there are pairs at which a
 proved loss begins or that keep runs elsewhere, they are dropped; else the proof goes on.
 """
 
@@ -31,6 +32,8 @@ NONE: Pairs = np.zeros((0, 2), dtype=np.int64)
 STALE = 4  # rounds that bring nothing, after which the search ends
 # Most seconds, and part of the time that is left, before a proof ends where pairs are at fault.
 MOMENT, PART = 30.0, 0.2
+EARLY = 0.5  # part of the time that is kept for a proof: then nothing more is dropped before it
+SOLVED = 10  # most models of a round
 LAST = 0.85  # part of the time that is left which a proof may take
 WORST = 0.5  # share of the largest undecided volume of a cell that is as bad
 
@@ -83,6 +86,7 @@ class Rounds:
         self.deadline, self.progress = deadline, progress
         self.lp: StabilizationLP = first.lp
         self.why = "no other control helps"
+        self.late = 0.0 if deadline.left is None else EARLY * deadline.left
         self.lossless = Lossless.of(self.lp, deadline, progress)
 
     def best(self) -> Round:
@@ -110,11 +114,8 @@ class Rounds:
     def _from(self, pairs: Pairs, spared: Bools | None) -> Round | None:
         """Return the best round of those that begin without some pairs."""
         given = NONE if self.lp.dropped is None else self.lp.dropped
-        dropped, stale, best = np.concatenate([given, pairs]), 0, None
-        if len(pairs):
-            trial = self.solved(dropped, spared, self.target)
-        else:
-            trial = self._proved(self.first, spared)
+        stale, best = 0, None
+        trial = self.solved(np.concatenate([given, pairs]), spared, self.target)
         while trial is not None:
             better = best is None or trial.worth(self.target) > best.worth(self.target)
             best, stale = (trial, 0) if better else (best, stale + 1)
@@ -123,40 +124,66 @@ class Rounds:
                 pairs = self.undecided(trial)
             if not len(pairs) or stale >= STALE:
                 break
-            dropped = np.concatenate([dropped, pairs])
-            trial = self.solved(dropped, spared, self.target)
+            trial = self.solved(_dropped(trial.result, pairs), spared, self.target)
         return best if best is None or best.whole else self._proved(best.result, None, whole=True)
 
     def solved(self, dropped: Pairs, spared: Bools | None, least: float = 0.0) -> Round | None:
         """Solve without some pairs, and prove; None where C is too small, or there is no time."""
-        if self.deadline():
-            self.why = "the time limit was reached"
-            return None
-        result = self.again(dropped)
-        if not result.verified or result.lp is None:
-            self.why = f"without more pairs the problem is {result.status}"
-            return None
-        if result.lp.n < least * self.lp.n:
-            self.why = f"without more pairs C has {result.lp.n} of {self.lp.n} cells"
-            return None
+        for _ in range(SOLVED):
+            if self.deadline():
+                self.why = "the time limit was reached"
+                return None
+            given = 0 if self.lp.dropped is None else len(self.lp.dropped)
+            result = self.first if len(dropped) == given else self.again(dropped)
+            if not result.verified or result.lp is None:
+                self.why = f"without more pairs the problem is {result.status}"
+                return None
+            if result.lp.n < least * self.lp.n:
+                self.why = f"without more pairs C has {result.lp.n} of {self.lp.n} cells"
+                return None
+            pairs = self._losing_some(result, spared)
+            if not len(pairs):
+                break
+            dropped = _dropped(result, pairs)
         return self._proved(result, spared)
+
+    def _losing_some(self, result: Result, spared: Bools | None) -> Pairs:
+        """Return pairs of the controller of which some of many states are lost.
+
+        Where losses are put up with, in other cells only, and in those that have other controls.
+        """
+        lp = result.lp
+        assert lp is not None
+        if self.lossless is None or not self._early():
+            return NONE
+        control = result.control_index[lp.cells].astype(np.int64)
+        pairs = self.lossless.losing_some(lp.cells, control)
+        if spared is None:
+            return pairs
+        return pairs[~spared[pairs[:, 0]] & np.isin(pairs[:, 0], _several(lp))]
+
+    def _early(self) -> bool:
+        """Return whether there is time enough to drop pairs."""
+        left = self.deadline.left
+        return left is None or left > self.late
 
     def _proved(self, result: Result, spared: Bools | None, whole: bool = False) -> Round:
         """Prove what becomes of a result's C; the ``whole``, or until pairs are at fault."""
         part = result.lp.n / self.lp.n if result.lp is not None else 1.0
         left = self.deadline.left
         moment = time.monotonic() + (MOMENT if left is None else min(MOMENT, PART * left))
+        ended = False
 
         def at_fault(cell: Indices, state: Statuses, level: Depths) -> bool:
             """Return whether a moment has passed, and decided boxes put pairs at fault."""
-            if whole or time.monotonic() < moment:
-                return False
-            return len(_faulty(cell, state, level, spared)) > 0
+            nonlocal ended
+            if not (ended or whole) and time.monotonic() > moment and self._early():
+                ended = len(_faulty(cell, state, level, spared)) > 0
+            return ended
 
         wanted = min(1.0, max(self.target / part, TARGET))  # less would leave losses undecided
         limit = None if left is None else LAST * left
         proof = prove(result, wanted, limit, self.progress, ending=at_fault)
-        ended = at_fault(proof.cell, proof.kind, proof.level)
         return Round(result, proof, proof.arrives * part, not ended)
 
     def guilty(self, trial: Round, spared: Bools | None, alone: bool) -> Pairs:
@@ -186,6 +213,13 @@ def _faulty(cell: Indices, state: Statuses, level: Depths, spared: Bools | None)
     if spared is not None:
         begins &= ~spared[cell]
     return np.asarray(cell[begins | (state == STAYS)])
+
+
+def _dropped(result: Result, pairs: Pairs) -> Pairs:
+    """Return the pairs that a model lacks, and some more."""
+    assert result.lp is not None
+    before = result.lp.dropped
+    return pairs if before is None else np.concatenate([before, pairs])
 
 
 def _several(lp: StabilizationLP) -> Indices:

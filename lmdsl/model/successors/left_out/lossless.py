@@ -114,20 +114,38 @@ class Lossless:
         all_lose = hopeless[dropped[:, 0]]
         return np.concatenate([dropped[~all_lose], self._worse(dropped[all_lose])]), hopeless
 
+    def losing_some(self, cells: Indices, control: Indices) -> Indices:
+        """Return the pairs of a controller under which some of many states leave its cells or A.
+
+        Shape (D, 2). There are more states than where all pairs are looked at.
+        """
+        sampled = _by_states(self.lp.problem, self.lp.partition, 2 * len(cells))
+        pairs = np.stack([cells, control], axis=-1)
+        return pairs[self._lost(pairs, cells, sampled) > 0]
+
     def _worse(self, pairs: Indices) -> Indices:
         """Return of pairs, all of their cells, those that lose more states than the best ones."""
-        lp = self.lp
-        allowed = np.zeros(lp.partition.size + 1, dtype=np.bool_)  # the last: nowhere
-        allowed[lp.cells] = allowed[:-1][self.transitions.sets.attractor] = True
-        sampler = Sampler(self.problem, lp.partition, None, self.transitions.sets)
-        lost = np.zeros(len(pairs), dtype=np.int64)
-        for j, (cell, control) in enumerate(pairs.tolist()):
-            block = Block(0, np.array([cell]), (control, control + 1))
-            index = sampler.images(block, sampler.values(block)).reshape(-1)
-            lost[j] = (~allowed[np.where(index >= 0, index, -1).astype(np.int64)]).sum()
-        least = np.full(lp.partition.size, np.iinfo(np.int64).max)
+        lost = self._lost(pairs, self.lp.cells, self.problem)
+        least = np.full(self.lp.partition.size, np.iinfo(np.int64).max)
         np.minimum.at(least, pairs[:, 0], lost)
         return pairs[lost > least[pairs[:, 0]]]
+
+    def _lost(self, pairs: Indices, cells: Indices, sampled: Problem) -> Indices:
+        """Return how many of some states every pair sends out of cells and A, shape (D,)."""
+        sets = self.transitions.sets
+        allowed = np.zeros(self.lp.partition.size + 1, dtype=np.bool_)  # the last: nowhere
+        allowed[cells] = allowed[:-1][sets.attractor] = True
+        sampler = Sampler(sampled, self.lp.partition, None, sets)
+        lost = np.zeros(len(pairs), dtype=np.int64)
+        some = max(1, sampler.chunk // sampler.samples)
+        for control in np.unique(pairs[:, 1]).tolist():
+            every = np.flatnonzero(pairs[:, 1] == control)
+            for at in np.split(every, range(some, len(every), some)):
+                block = Block(0, pairs[at, 0], (control, control + 1))
+                index = sampler.images(block, sampler.values(block)).reshape(-1, len(at))
+                where = np.where(index >= 0, index, -1).astype(np.int64)
+                lost[at] = (~allowed[where]).sum(axis=0)
+        return lost
 
 
 def _by_states(problem: Problem, partition: Partition, pairs: int) -> Problem:
