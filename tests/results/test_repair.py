@@ -11,6 +11,7 @@ from saved_results import put, refused
 
 import lmdsl as lm
 from lmdsl.cli import main
+from lmdsl.proof import proving
 from lmdsl.results.directory import reading
 from lmdsl.results.directory.rounds import NONE, Rounds
 
@@ -109,6 +110,38 @@ def test_where_some_loss_is_unavoidable_the_control_that_loses_less_is_taken():
     assert found.proved.reached
     given_up = lm.solve(made(line(steep)), proved=0.6)
     assert (given_up.proof.lost, given_up.stabilizable_cells) == (0, 2)
+
+
+def plane(seed):
+    """A random map of a square, sampled so sparsely that controllers lose runs."""
+    a, b, c = np.random.default_rng(seed).uniform(0.6, 1.0, size=3).round(3).tolist()
+    return {
+        "format": "lmdsl/1",
+        "system": {
+            "kind": "map",
+            "next": {"x": f"x + {a}*y + 0.1*u", "y": f"y - {b}*sin({c}*x) + 0.4*u"},
+        },
+        "state_box": {name: {"low": -1, "high": 1, "cells": 16} for name in "xy"},
+        "attractor": {"boxes": [{"x": [-0.375, 0.375], "y": [-0.375, 0.375]}]},
+        "control_grid": {"u": {"low": -1, "high": 1, "points": 9}},
+        "stage_cost": "1 + 0.1*u**2",
+        "sampling": {"kind": "grid", "per_axis": 1},
+    }  # fmt: skip
+
+
+def test_runs_of_the_true_map_are_lost_before_repair_and_not_after(monkeypatch):
+    monkeypatch.setattr(proving, "FEW", 0)  # bounds of the cost are of no interest here
+    monkeypatch.setattr(proving, "GROWN", 1)
+    problem = made(plane(0))
+    declared, found = lm.solve(problem), lm.solve(problem, proved=0.2)
+    assert declared.prove(0.9).lost > 0.01
+    assert (found.proof.lost, found.proof.stays) == (0, 0)
+    assert 0.2 <= found.proved.arrives <= found.proved.without_loss
+    runs = found.simulate(100_000, 200, seed=0, as_compiled=True)
+    undecided = found.proof.undecided
+    assert runs.lost <= 1e5 * undecided + 5 * np.sqrt(1e5 * undecided)
+    assert declared.simulate(1000, 200, seed=0, as_compiled=True).lost > 0
+    assert found.stabilizable_cells / declared.stabilizable_cells <= found.proved.without_loss
 
 
 def test_nothing_to_repair_drops_nothing(tmp_path):

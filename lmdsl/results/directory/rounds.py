@@ -32,7 +32,7 @@ NONE: Pairs = np.zeros((0, 2), dtype=np.int64)
 STALE = 4  # rounds that bring nothing, after which the search ends
 # Most seconds, and part of the time that is left, before a proof ends where pairs are at fault.
 MOMENT, PART = 30.0, 0.2
-EARLY = 0.5  # part of the time that is kept for a proof: then nothing more is dropped before it
+EARLY = 0.35  # part of the time that is kept for a proof: then nothing more is dropped before it
 SOLVED = 10  # most models of a round
 LAST = 0.85  # part of the time that is left which a proof may take
 WORST = 0.5  # share of the largest undecided volume of a cell that is as bad
