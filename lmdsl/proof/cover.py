@@ -29,7 +29,8 @@ class Tree(NamedTuple):
         Along which it is or would be bisected.
     way
         Shape (nodes, 2), what a search for undecided leaves reads: of an undecided node that is
-        bisected, child * 16 + axis and the place of its middle; of others -1 less the state.
+        bisected, child * 16 + axis and the place of its middle; of others -1 less the state and,
+        packed, first, images and flags.
     split, place
         Shape (nodes, d): see the module.
     state, flags
@@ -147,7 +148,7 @@ class Cover:
         first = self.used + np.concatenate([[0], np.cumsum(count)])
         total = int(first[-1])
         if total > len(self.places):
-            larger = np.zeros((max(total, len(self.places) * 3 // 2), *self.places.shape[1:]),
+            larger = np.empty((max(total, len(self.places) * 3 // 2), *self.places.shape[1:]),
                               dtype=np.int64)  # fmt: skip
             larger[: self.used] = self.places[: self.used]
             self.places = larger

@@ -89,6 +89,7 @@ class Prover:
             self.cover.places[at], self.cover.more[at] = seen.place, seen.more
             tree.flags[nodes], tree.axis[nodes] = seen.flags, seen.axis
             tree.dearest[nodes], tree.cheapest[nodes] = seen.dearest, seen.cheapest
+            rounds.pack_all(tree, nodes)
 
     def add(self, nodes: Indices, bisected: Indices | None = None) -> None:
         """Enclose the images of new leaves, and decide what can be decided.
@@ -133,6 +134,8 @@ class Prover:
     def room(self, bisected: int) -> bool:
         """Return whether there is memory to bisect so many leaves, arrays made anew included."""
         cover = self.cover
+        if cover.count + 2 * bisected <= len(cover.tree.cell) and cover.used < len(cover.places):
+            return True  # none is needed
         each = node_bytes(cover.partition.dimension, len(self.images.noise[0]))
         return memory.fits(2.0 * each * (2 * bisected + cover.count))
 

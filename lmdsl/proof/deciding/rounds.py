@@ -23,6 +23,7 @@ from lmdsl.proof.search import (
 )
 
 AXES = 16  # one more than the number of the last axis: a way is child * AXES + axis
+KNOWN, MANY = 3, 2**20  # binary digits of flags, and a number of images that is not packed
 
 
 @kernel
@@ -33,6 +34,21 @@ def renew(tree, count):  # type: ignore[no-untyped-def]
             lead(tree, n)
         else:
             tree.way[n, 0] = -1 - np.int64(tree.state[n])
+            pack(tree, n)
+
+
+@kernel
+def pack(tree, n):  # type: ignore[no-untyped-def]
+    """Put what a search needs of a leaf in one place: one read from memory, not three."""
+    images = min(np.int64(tree.images[n]), MANY - 1)
+    tree.way[n, 1] = ((tree.first[n] * MANY + images) << KNOWN) + np.int64(tree.flags[n])
+
+
+@kernel
+def pack_all(tree, nodes):  # type: ignore[no-untyped-def]
+    """Do so for nodes."""
+    for j in range(len(nodes)):
+        pack(tree, nodes[j])
 
 
 @kernel
@@ -96,10 +112,14 @@ def look(search, b):  # type: ignore[no-untyped-def]
     """Return an undecided leaf that the images of a node meet; without one -1 less what is met."""
     tree, d = search.tree, len(search.cells)
     first, last, at, low, high = search.odometer
-    flags, bits, leaf = tree.flags[b], 0, np.int64(-1)
+    packed, bits, leaf = tree.way[b, 1], 0, np.int64(-1)
+    flags, count, start = packed & ((1 << KNOWN) - 1), (packed >> KNOWN) % MANY, packed >> KNOWN
+    start //= MANY
+    if count == MANY - 1:
+        count = np.int64(tree.images[b])
     bits |= MEETS_LOST if flags & MAY_LEAVE else 0
     bits |= MEETS_ARRIVING if flags & MAY_ARRIVE else 0
-    for j in range(tree.first[b], tree.first[b] + tree.images[b]):
+    for j in range(start, start + count):
         image = search.places[j]
         if image[0, 0] > image[0, 1]:
             continue  # nothing of it is in the box
