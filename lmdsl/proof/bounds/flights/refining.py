@@ -27,6 +27,7 @@ CLOSE = 0.05  # part of the upper bound that the lower one may lack: then it is 
 FEW = 2**18  # parts up to which cells are cut without a time limit
 MOST = 2**26  # parts up to which they are cut at all
 ROUNDS = 16  # by what is known of so many shares of the parts others are bounded in turn
+SMALL = 2**17  # parts up to which it is not asked how long it takes
 HELPED = 0.99  # of the mean bound, above which following the same parts again has not helped
 BYTES = 24  # of a part, with all that is held meanwhile
 DEEPEST = 20  # bisections of an axis
@@ -100,6 +101,8 @@ def close(boxes: Arrays) -> bool:
 def _fits(parts: Parts, deadline: Deadline, last: float) -> bool:
     """Return whether there is time and memory for so many parts."""
     left, more = deadline.left, 2.0 ** (len(parts.shape) - 1)
+    if parts.size <= SMALL:  # what was last also compiled kernels
+        return not deadline()
     if left is None and parts.size > FEW:
         return False
     return (

@@ -15,6 +15,7 @@ from lmdsl.proof.bounds.optimum.moves import DEEPEST, Game, Parts
 from lmdsl.proof.loop import Loop
 
 FEW = 2**22  # rows up to which cells are cut without a time limit
+SMALL = 2**19  # rows up to which it is not asked how long they take
 GROWS = 1.5  # by how much more the time grows than the rows
 Cut = NDArray[np.uint8]
 
@@ -73,6 +74,7 @@ def _room(game: Game, grid: Parts, taken: float, deadline: Deadline) -> int:
     for axes in range(len(grid.split), 0, -1):
         parts = 2**axes
         late = deadline.left is not None and GROWS * parts * taken > deadline.left
+        late &= parts * rows > SMALL or deadline()  # what was taken also compiled kernels
         many = deadline.left is None and parts * rows > FEW
         large = parts * grid.size >= 2**31 or not memory.fits(3.0 * game.row_bytes() * parts * rows)
         if not (late or many or large) and (grid.split < DEEPEST).all():
