@@ -80,10 +80,11 @@ def _again(flights: Flights, found: Above, todo: Bools, deadline: Deadline, last
     parts, known = Parts.of(flights.loop.partition, found.split.astype(np.int64)), found.bound
     mean = np.inf
     while deadline.left is not None and deadline.left > last:
-        finite = known[np.isfinite(known)].mean(dtype=np.float64)
-        if not finite < HELPED * mean:
+        finite = known[np.isfinite(known)]
+        now = float(finite.mean(dtype=np.float64)) if len(finite) else np.inf
+        if not now < HELPED * mean:
             break
-        began, mean = time.monotonic(), finite
+        began, mean = time.monotonic(), now
         with suppress(Stopped):
             todo = _improved(flights, parts, known, np.flatnonzero(todo), deadline)
         last = time.monotonic() - began
@@ -101,15 +102,12 @@ def close(boxes: Arrays) -> bool:
 def _fits(parts: Parts, deadline: Deadline, last: float) -> bool:
     """Return whether there is time and memory for so many parts."""
     left, more = deadline.left, 2.0 ** (len(parts.shape) - 1)
+    if left is None:
+        return parts.size <= FEW
     if parts.size <= SMALL:  # what was last also compiled kernels
         return not deadline()
-    if left is None and parts.size > FEW:
-        return False
-    return (
-        parts.size <= MOST
-        and memory.fits(float(BYTES) * parts.size)
-        and (left is None or left > 0.5 * more * last)
-    )
+    fits = parts.size <= MOST and memory.fits(float(BYTES) * parts.size)
+    return fits and left > 0.5 * more * last
 
 
 def _improved(
