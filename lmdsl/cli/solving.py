@@ -1,6 +1,7 @@
 """``solve`` and ``compare``."""
 
 import argparse
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -199,7 +200,23 @@ def _enclosed(result: Any) -> str:
     claim = "no run of the map as compiled is lost (claim 7)" if safe else "claim 7 is not proved"
     if safe == "assumed":
         claim = "no run is lost, assuming the Lipschitz constants (claim 7 is assumed, not proved)"
-    return f"{claim}; {sure}; the lower bound speaks of surviving pairs"
+    missed = _missed(result) if safe else ""
+    return f"{claim}{missed}; {sure}; the lower bound speaks of surviving pairs"
+
+
+def _missed(result: Any) -> str:
+    """Return how likely noise is that enclosures do not cover; nothing where they cover all."""
+    from lmdsl.problem.noise import NoiseNormal
+
+    noise = (result.problem.noise or {}).values()
+    share = sum(each.missed() for each in noise if isinstance(each, NoiseNormal))
+    if not share:
+        return ""
+    unit = 10.0 ** (math.floor(math.log10(share)) - 1)
+    return (
+        " while noise stays within the standard deviations that are covered, which a step leaves "
+        f"with probability {math.ceil(share / unit) * unit:.1e} at most"
+    )
 
 
 def _discount(result: Any) -> str:

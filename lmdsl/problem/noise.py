@@ -108,9 +108,18 @@ class NoiseNormal(Declared):
         nodes, _ = self.nodes()
         if self.normal.within is None:
             return nodes, nodes
-        reach = max(float(nodes[-1]), self.normal.within * self.normal.std)
+        reach = self._reach(self.normal.within)
         ends = np.linspace(-reach, reach, self.normal.points + 1)
         return ends[:-1], ends[1:]
+
+    def missed(self) -> float:
+        """Return the probability of what enclosures do not cover, rounded up."""
+        if self.normal.within is None:
+            return 1.0
+        return math.erfc(self._reach(self.normal.within) / self.normal.std / math.sqrt(2)) * 1.001
+
+    def _reach(self, within: float) -> float:
+        return max(float(self.nodes()[0][-1]), within * self.normal.std)
 
 
 class Uniform(Declared):

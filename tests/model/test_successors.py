@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import lmdsl as lm
+from lmdsl.cli import main
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.transitions import assemble
@@ -301,6 +302,18 @@ def test_a_spoiled_directory_is_refused(tmp_path, spoil):
 def test_what_cannot_be_enclosed_is_refused(change, where):
     with pytest.raises(lm.BadInput, match=f"^{where}: "):
         PROBLEMS["line"].replaced(**change)
+
+
+def test_how_likely_noise_is_that_is_not_covered_is_printed(tmp_path, capsys):
+    """Beyond 3 standard deviations 0.27 % of a normal variable lie, of two at most twice that."""
+    normal = {"normal": {"std": 0.05, "points": 3, "within": 3}}
+    problem = PROBLEMS["line"].replaced(
+        system={"kind": "map", "next": {"x": "0.5*x + 0.1*w + 0.1*v"}},
+        noise={"w": normal, "v": normal},
+    )
+    problem.save(tmp_path / "noisy.json")
+    assert main(["solve", str(tmp_path / "noisy.json"), "--no-simulate"]) == 0
+    assert "a step leaves with probability 5.5e-03 at most" in capsys.readouterr().out
 
 
 def test_within_bounds_normal_noise():
