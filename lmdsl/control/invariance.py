@@ -7,6 +7,7 @@ proved of the map as computed, with its rounding, and so of what a simulation ca
 
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice, product
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,7 @@ CHUNK = 8192  # cells enclosed at a time
 WORK = 2e7  # number of operations on boxes above which no cell is enclosed any more: seconds
 OVERHEAD = 1000  # boxes whose arithmetic costs as much as NumPy's own work for an operation
 ROUNDS = 14  # number of halvings of an axis above which a box is given up
+CORNERS = 32  # most states of a cell, and values of noise, that are tried beforehand
 MEETS = 512  # number of cells that an image meets above which nothing is claimed of it
 DOING = "checking the local controller"
 
@@ -182,9 +184,10 @@ def keeping(problem: Problem, local: LocalController | HoldingLaw) -> Bools:
     """Return attractor cells that a law is proved to keep for ever, shape (N,).
 
     That is the greatest set in which all that a whole cell is mapped to lies, as far as some work
-    shows; found from above: of a set, the cells that are not mapped into it are left out.
+    shows; found from above: of a set, the cells that are not mapped into it are left out, first
+    those of which that can be seen at a few states.
     """
-    inside, work = local.attractor.copy(), WORK
+    inside, work = _seen_to_stay(_Loop(problem, local, Deadline())), WORK
     while inside.any() and work > 0:
         loop, kept = _Loop(problem, replace(local, attractor=inside), Deadline()), inside.copy()
         cells = np.flatnonzero(inside)
@@ -196,6 +199,26 @@ def keeping(problem: Problem, local: LocalController | HoldingLaw) -> Bools:
             return inside
         inside = kept
     return np.zeros_like(inside)
+
+
+def _seen_to_stay(loop: _Loop) -> Bools:
+    """Return the greatest set of attractor cells of which no state tried is led out, shape (N,)."""
+    partition, cells = loop.partition, np.flatnonzero(loop.local.attractor)
+    index = np.stack(partition.multi_index(cells), axis=-1)
+    noise, led = np.unique(np.concatenate(loop.parts), axis=0)[:CORNERS], []
+    for corner in islice(product((0.5, 0.0, 1.0 - 1e-6), repeat=partition.dimension), CORNERS):
+        x = partition.low + (index + np.array(corner)) * partition.width
+        u = loop.local(x, cells)
+        for w in noise:
+            images = loop.true_map(list(x.T), list(u.T), list(w), loop.guard)
+            led.append(partition.locate([np.broadcast_to(y, len(cells)) for y in images]))
+    inside: Bools = loop.local.attractor.copy()
+    while True:
+        stays = np.all([(to >= 0) & inside[to] for to in led], axis=0) & inside[cells]
+        if stays.sum() == inside.sum():
+            return inside
+        inside = np.zeros_like(inside)
+        inside[cells[stays]] = True
 
 
 def _kept(loop: _Loop, cells: Indices, limit: float) -> tuple[Bools, float]:

@@ -10,9 +10,13 @@ from local_controllers import ORBIT, linear_system, local_of
 from problems import doubling, made, standard_map
 
 import lmdsl as lm
-from lmdsl.control.invariance import examine
+from lmdsl.control.invariance import examine, keeping
 from lmdsl.formulas.enclosures import Jet, apply
 from lmdsl.formulas.intervals import Interval
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local.controller import LocalController
+from lmdsl.model.sets import CellSets
+from lmdsl.model.true_map import TrueMap
 
 
 @pytest.mark.long
@@ -283,3 +287,36 @@ def test_all_of_the_declared_noise_is_enclosed():
     assert kept({"normal": {"std": 0.23, "points": 3, "within": 3.0}})[0] == 12
     wide = kept({"normal": {"std": 0.4, "points": 3, "within": 0.1}})  # nodes at 0.69 count still
     assert wide[0] == 12
+
+
+def test_states_of_cells_that_a_law_keeps_for_ever_never_leave_them():
+    """A square about rest under linear feedback: its corners leave it, an inner part never does."""
+    problem = made({
+        "format": "lmdsl/1",
+        "system": {"kind": "map", "next": {"x": "x + 0.3*y + w", "y": "y + 0.3*u"}},
+        "state_box": {name: {"low": -1, "high": 1, "cells": 40} for name in "xy"},
+        "attractor": {"boxes": [{"x": [-0.5, 0.5], "y": [-0.5, 0.5]}]},
+        "control_grid": {"u": {"low": -2, "high": 2, "points": 3}},
+        "noise": {"w": {"uniform": {"low": -0.01, "high": 0.01, "points": 2}}},
+        "stage_cost": "1",
+        "sampling": {"kind": "grid", "per_axis": 1},
+        "local_controller": {"kind": "linear", "orbit": [[0, 0]],
+                             "gain": {"u": {"x": 1.2, "y": 1.8}}},
+    })  # fmt: skip
+    partition = Partition.of(problem)
+    attractor = CellSets.of(problem, partition).attractor
+    law = LocalController.of(problem, partition, attractor)
+    inside = keeping(problem, law)
+    report = examine(problem, law)
+    assert 0 < inside.sum() < report.proved < attractor.sum()  # others are kept for a step only
+    rng, true_map = np.random.default_rng(2), TrueMap(problem, partition)
+    cell = np.repeat(np.flatnonzero(inside), 4)
+    place = np.stack(partition.multi_index(cell), axis=-1)
+    x = partition.low + (place + rng.choice([0, 0.5, 1, 1e-12], place.shape)) * partition.width
+    x, cell = partition.enter(x)
+    x, cell = x[inside[cell]], cell[inside[cell]]
+    for _ in range(100):
+        u = law(x, cell)
+        noise = [rng.choice([-0.01, 0.01], len(x))]
+        x, cell = true_map.step(true_map.named(list(x.T), list(u.T), noise))
+        assert inside[cell].all()
