@@ -147,6 +147,14 @@ def test_states_that_lose_are_runs_of_the_true_map():
         assert not kept[lp.partition.enter(images)[1]].all()
 
 
+def test_what_takes_minutes_is_not_looked_at(monkeypatch):
+    lp = lm.compile(line(STEEP))
+    monkeypatch.setattr(lossless, "LARGEST", 3 * 2 * 2 - 1)
+    assert known(lp.problem, lp) is None
+    monkeypatch.setattr(lossless, "LARGEST", 3 * 2 * 2)
+    assert known(lp.problem, lp) is not None
+
+
 def test_what_is_too_fine_for_doubles_is_not_looked_at():
     problem = line("x - 1", state_box={"x": {"low": 1e9, "high": 1e9 + 4, "cells": 4}})
     lp = lm.compile(problem)

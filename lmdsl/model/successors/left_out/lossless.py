@@ -18,6 +18,7 @@ from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.sampler import Block, Sampler
 from lmdsl.model.assembly.transitions import Transitions, assemble
+from lmdsl.model.discretization import node_count
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import keeping, sets_of
@@ -26,6 +27,7 @@ from lmdsl.problem.sampling import Grid
 
 SAMPLES = 2**23  # most samples of all pairs, unless FEWEST an axis take more
 FEWEST, MOST = 2, 33  # points an axis
+LARGEST = 2**27  # samples above which it is not looked at all: minutes of work
 INSET = 2.0**-20  # of a cell, by which points lie within it: they are states of it, not of others
 
 
@@ -63,11 +65,14 @@ class Lossless:
     def of(
         cls, lp: StabilizationLP, deadline: Deadline, progress: Progress | None = None
     ) -> Self | None:
-        """Look at some states of all cells; None where there is no time or memory for that."""
+        """Look at some states of all cells; None where that takes too long, or too much memory."""
         partition, sets = lp.partition, sets_of(lp.cell_status)
         if max(axis.margin for axis in partition.axes) > INSET / 4:
             return None  # too fine for doubles: it is not known in which cell such states lie
-        problem = _by_states(lp.problem, partition, len(sets.free) * len(lp.controls))
+        pairs = len(sets.free) * len(lp.controls)
+        if pairs * node_count(lp.problem) * FEWEST**partition.dimension > LARGEST:
+            return None
+        problem = _by_states(lp.problem, partition, pairs)
         try:
             found = assemble(problem, partition, progress, deadline, sets)
         except (BadInput, TimeLimitReached):
@@ -150,7 +155,7 @@ class Lossless:
 
 def _by_states(problem: Problem, partition: Partition, pairs: int) -> Problem:
     """Return the problem sampled by states, and nothing of it but motion and sets."""
-    k = int((SAMPLES / max(pairs, 1)) ** (1 / partition.dimension))
+    k = int((SAMPLES / max(pairs * node_count(problem), 1)) ** (1 / partition.dimension))
     k = min(max(k, FEWEST), MOST)
     plain = problem.replaced(
         stage_cost="0", cost_rate=None, terminal_cost=None, admissible=None,
