@@ -1,7 +1,7 @@
 """How the bracket of the optimal cost shrinks with the cells, on the standard map.
 
 ``python -m benchmarks.bracket [--seconds S] [--cells 50,100] [--out FILE]`` prints a table and
-draws it into FILE, with maps of the bracket on the finest cells. Upper bounds begin with nothing
+draws it into FILE, with maps of the bracket by cell. Upper bounds begin with nothing
 but the attractor: what has one is proved to arrive, as no state leaves the torus and C and A are
 all of it. Averages are over these parts; random states of them are followed by the true map.
 """
@@ -114,7 +114,7 @@ def mean_cost(result: lm.Result, boxes: dict[str, Any]) -> float:
 
 
 def drawn(found: list[Found], path: Path) -> None:
-    """Draw the rows, and maps of the last one."""
+    """Draw the rows, and maps of the second one, or the last."""
     from lmdsl.plotting import layers
 
     page = layers.blank(3, 1)
@@ -126,22 +126,24 @@ def drawn(found: list[Found], path: Path) -> None:
         ("mean", "mean of runs", "o--"),
         ("below", "any law costs at least", "^-"),
     ):
-        ax.plot(cells, [getattr(row, name) for row in rows], style, label=label)
-    ax.fill_between(cells, [r.below for r in rows], [r.above for r in rows], alpha=0.12)
+        ax.plot(cells, [getattr(row, name) / row.mean for row in rows], style, label=label)
+    ends = ([r.below / r.mean for r in rows], [r.above / r.mean for r in rows])
+    ax.fill_between(cells, *ends, alpha=0.12)
     ax.set_xscale("log")
     ax.set_xticks(cells, [str(n) for n in cells])
     ax.minorticks_off()
     ax.set_ylim(0, None)
     ax.set_xlabel("cells an axis")
-    ax.set_title("average cost over what arrives", fontsize=11)
+    ax.set_title("average cost, by the mean of runs", fontsize=11)
     ax.set_box_aspect(1)
     ax.legend(fontsize=8)
-    side = cells[-1]
+    mapped = found[min(1, len(found) - 1)]
+    side = mapped.row.cells
     for k, name in enumerate(("below", "above")):
         ax = page.add_subplot(1, 3, k + 2)
-        values = getattr(found[-1], name).reshape(side, side)
+        values = getattr(mapped, name).reshape(side, side)
         picture = ax.imshow(values.T, origin="lower", extent=(0, 1, 0, 1), vmin=0,
-                            vmax=float(np.nanquantile(found[-1].above, 0.99)))  # fmt: skip
+                            vmax=float(np.nanquantile(mapped.above, 0.99)))  # fmt: skip
         ax.set_title(("any law costs at least", "this controller costs at most")[k], fontsize=11)
         ax.set_xlabel("x")
         ax.set_ylabel("y")

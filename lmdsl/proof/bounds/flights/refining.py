@@ -5,7 +5,6 @@ cut and followed again: the rest of a way is bounded by what is known so far.
 """
 
 import time
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +27,8 @@ FEW = 2**18  # parts up to which cells are cut without a time limit
 MOST = 2**26  # parts up to which they are cut at all
 ROUNDS = 16  # by what is known of so many shares of the parts others are bounded in turn
 SMALL = 2**17  # parts up to which it is not asked how long it takes
-HELPED = 0.99  # of the mean bound, above which following the same parts again has not helped
+SWEEPS = 8  # times that the same parts are followed at most
+HELPED = 1.01  # by how much that must make bounds better to be done again
 BYTES = 24  # of a part, with all that is held meanwhile
 DEEPEST = 20  # bisections of an axis
 
@@ -53,42 +53,51 @@ def refine(
 ) -> Above | None:
     """Return bounds on parts as fine as time and memory allow; None where there is no time."""
     loop = flights.loop
-    found, todo, last = None, np.zeros(0, dtype=np.bool_), 0.0
+    found, todo, last = None, np.ones(0, dtype=np.bool_), 0.0
     split = np.zeros(loop.partition.dimension, dtype=np.int64)
     while True:
         parts, began = Parts.of(loop.partition, split), time.monotonic()
         if found is not None and not _fits(parts, deadline, last):
-            return _again(flights, found, todo, deadline, last)
+            return found
         known = begun(flights, boxes, parts)
+        some = np.arange(parts.size)
         if found is not None:
             np.minimum(known, carried(loop, found, parts), out=known)
-        try:
-            some = np.arange(parts.size) if found is None else finer(loop, parts, todo)
-            todo = _improved(flights, parts, known, some, deadline)
-        except Stopped:
-            return Above(split.astype(np.uint8), known)
+            some = finer(loop, parts, todo)
+        torn = _swept(flights, parts, known, some, deadline)
         found, last = Above(split.astype(np.uint8), known), time.monotonic() - began
         if progress is not None:
             progress("refine", -1.0)
-        if not todo.any() or (split >= DEEPEST).any():
+        if torn is None or not torn.any() or (split >= DEEPEST).any():
             return found
-        split = split + 1
+        split, todo = split + 1, torn
 
 
-def _again(flights: Flights, found: Above, todo: Bools, deadline: Deadline, last: float) -> Above:
-    """Follow parts that are torn again, by what is known of others now, while that helps."""
-    parts, known = Parts.of(flights.loop.partition, found.split.astype(np.int64)), found.bound
-    mean = np.inf
-    while deadline.left is not None and deadline.left > last:
-        finite = known[np.isfinite(known)]
-        now = float(finite.mean(dtype=np.float64)) if len(finite) else np.inf
-        if not now < HELPED * mean:
+def _swept(
+    flights: Flights, parts: Parts, known: Upper, some: Indices, deadline: Deadline
+) -> Bools | None:
+    """Follow parts, and those that are torn again, by what is known of others now, while it helps.
+
+    Return which are torn still; None where time was up.
+    """
+    torn, before = None, _good(known)
+    for _ in range(SWEEPS):
+        try:
+            torn = _improved(flights, parts, known, some, deadline)
+        except Stopped:
+            return None
+        now, some = _good(known), np.flatnonzero(torn)
+        if not now > HELPED * before:
             break
-        began, mean = time.monotonic(), now
-        with suppress(Stopped):
-            todo = _improved(flights, parts, known, np.flatnonzero(todo), deadline)
-        last = time.monotonic() - began
-    return found
+        before = now
+    return torn
+
+
+def _good(known: Upper) -> float:
+    """Return how good bounds are: the mean of 1/(1 + bound), 0 where nothing is known."""
+    with np.errstate(divide="ignore", over="ignore"):
+        finite = known[known > -np.inf]
+        return float((1.0 / (1.0 + np.abs(finite))).mean(dtype=np.float64)) if len(finite) else 0.0
 
 
 def close(boxes: Arrays) -> bool:
