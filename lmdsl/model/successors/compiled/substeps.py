@@ -27,6 +27,7 @@ class GroupRoom(NamedTuple):
     last_centre: Floats
     away: Floats
     arc: Floats
+    work: Floats
 
 
 class GroupStretches(NamedTuple):
@@ -54,7 +55,7 @@ def room_for(shared: Shared, own: int) -> GroupRoom:
     return GroupRoom(
         registers(shared.advance.box), registers(shared.advance.centre),
         registers(shared.last.box), registers(shared.last.centre),
-        np.zeros((shared.sizes[1], 2, BLOCK)), np.zeros((5, own, 2, BLOCK)),
+        np.zeros((shared.sizes[1], 2, BLOCK)), np.zeros((5, own, 2, BLOCK)), np.zeros((7, BLOCK)),
     )  # fmt: skip
 
 
@@ -97,57 +98,74 @@ def _read(target, tapes, boxed, centred, away, first, rows):  # type: ignore[no-
 
 
 @kernel
-def _part(c, arc, j, i):  # type: ignore[no-untyped-def]
-    """Return the ends of a part of an arc, and of the way from its start to its later points."""
-    least, most, low, high, slack = 0.0, 0.0, 0.0, 0.0, 0.0
-    for k in range(3):
-        slack += max(abs(arc[FIRST + k, j, 0, i]), abs(arc[FIRST + k, j, 1, i]))
-    slack *= SLACK
-    for p in range(4):
-        a, b = 0.0, 0.0
-        for k in range(3):
-            row = arc[FIRST + k, j]
-            if c[p, k] > 0.0:
-                a, b = a + c[p, k] * row[0, i], b + c[p, k] * row[1, i]
-            elif c[p, k] < 0.0:
-                a, b = a + c[p, k] * row[1, i], b + c[p, k] * row[0, i]
-        a, b = a - slack, b + slack
-        if p == 0:
-            least, most = a, b
-        elif p == 1:
-            low, high = a, b
-        else:
-            low, high = min(low, a), max(high, b)
-    least, most = min(least, low), max(most, high)
-    s, e = arc[START, j, 0, i], arc[START, j, 1, i]
-    x, y = s + least, e + most
-    x, y = x - abs(x) * UNIT, y + abs(y) * UNIT
-    if (least == 0.0) & (most == 0.0):
-        x, y = s, e
-    elif (s == 0.0) & (e == 0.0):
-        x, y = least, most
-    sound = y - x < np.inf
-    return x if sound else -np.inf, y if sound else np.inf, low, high
+def _point(c, slopes, slack, low, high):  # type: ignore[no-untyped-def]
+    """Fill in what holds the way from the start of an arc to a Bernstein point of a part of it."""
+    for i in range(np.uint64(BLOCK)):
+        low[i] = high[i] = 0.0
+    for k in range(len(c)):
+        if c[k] != 0.0:
+            least, most = slopes[k, 0], slopes[k, 1]
+            if c[k] < 0.0:
+                least, most = most, least
+            for i in range(np.uint64(BLOCK)):
+                low[i] += c[k] * least[i]
+                high[i] += c[k] * most[i]
+    for i in range(np.uint64(BLOCK)):
+        low[i] -= slack[i]
+        high[i] += slack[i]
 
 
 @kernel
-def _arc(s, points, arc, width, limits, found):  # type: ignore[no-untyped-def]
+def _part(points, start, slopes, work):  # type: ignore[no-untyped-def]
+    """Fill in what holds a part of an arc, and the way from its start to its later points."""
+    slack, a, b = work[0], work[1], work[2]
+    x, y, low, high = work[3], work[4], work[5], work[6]
+    _point(points[1], slopes, slack, low, high)
+    for p in range(2, 4):
+        _point(points[p], slopes, slack, a, b)
+        for i in range(np.uint64(BLOCK)):
+            low[i] = low[i] if low[i] < a[i] else a[i]
+            high[i] = high[i] if high[i] > b[i] else b[i]
+    _point(points[0], slopes, slack, a, b)
+    for i in range(np.uint64(BLOCK)):
+        s, e = start[0, i], start[1, i]
+        least, most = a[i] if a[i] < low[i] else low[i], b[i] if b[i] > high[i] else high[i]
+        p, q = s + least, e + most
+        p, q = p - abs(p) * UNIT, q + abs(q) * UNIT
+        still, zero = (least == 0.0) & (most == 0.0), (s == 0.0) & (e == 0.0)
+        p, q = least if zero else p, most if zero else q
+        p, q = s if still else p, e if still else q
+        sound = q - p < np.inf
+        x[i], y[i] = p if sound else -np.inf, q if sound else np.inf
+
+
+@kernel
+def _arc(s, points, room, width, limits, found):  # type: ignore[no-untyped-def]
     """Note all that is known of the s-th arc."""
     begin, end = limits
+    arc, work = room.arc, room.work
+    slack, x, y, low, high = work[0], work[3], work[4], work[5], work[6]
     for j in range(len(width)):
+        slopes = arc[FIRST : WAY + 1, j]
+        for i in range(BLOCK):
+            slack[i] = 0.0
+            for k in range(3):
+                a, b = abs(slopes[k, 0, i]), abs(slopes[k, 1, i])
+                slack[i] += a if a > b else b
+            slack[i] *= SLACK
         for i in range(end - begin):
-            for k in range(FIRST, LAST + 1):
-                a, b = arc[k, j, 0, i], arc[k, j, 1, i]
+            for k in range(2):  # the slopes at both ends
+                a, b = slopes[k, 0, i], slopes[k, 1, i]
                 least = 0.0 if (a <= 0.0) & (b >= 0.0) else min(abs(a), abs(b)) / width[j]
                 found.steep[s, begin + i] = max(found.steep[s, begin + i], least)
         for p in range(len(points)):
             at = s * len(points) + p
+            _part(points[p], arc[START, j], slopes, work)
             for i in range(end - begin):
-                x, y, low, high = _part(points[p], arc, j, i)
-                found.low[at, j, begin + i], found.high[at, j, begin + i] = x, y
+                found.low[at, j, begin + i], found.high[at, j, begin + i] = x[i], y[i]
                 if at == 0:
-                    found.rises[0, j, begin + i] = low >= 0.0
-                    found.falls[0, j, begin + i] = high <= 0.0
+                    found.rises[0, j, begin + i] = low[i] >= 0.0
+                    found.falls[0, j, begin + i] = high[i] <= 0.0
 
 
 @kernel
@@ -184,7 +202,7 @@ def enclose_substeps(  # type: ignore[no-untyped-def]
             if path:
                 _read(arc[LAST], tapes, room.box, room.centre, room.away, q, none)
                 if s > 0:
-                    _arc(s - 1, points, arc, width, (begin, end), found)
+                    _arc(s - 1, points, room, width, (begin, end), found)
                 _pass(arc[KNOT], arc[START], own)
                 _pass(arc[LAST], arc[FIRST], own)
                 _read(arc[WAY], tapes, room.box, room.centre, room.away, q + own, none)
@@ -197,7 +215,7 @@ def enclose_substeps(  # type: ignore[no-untyped-def]
             run(shared.last.box, room.last_box)
             run(shared.last.centre, room.last_centre)
             _read(arc[LAST], shared.last, room.last_box, room.last_centre, room.away, 0, none)
-            _arc(substeps - 1, points, arc, width, (begin, end), found)
+            _arc(substeps - 1, points, room, width, (begin, end), found)
         last = len(found.low) - 1
         for j in range(own):
             for i in range(end - begin):
