@@ -54,16 +54,13 @@ class AxisCells(NamedTuple):
 
         On a circle, every turn adds ``cells``.
         """
-        turns, x = self._turned(np.asarray(image, dtype=np.float64), clip)
-        with np.errstate(all="ignore"):
-            t = (x - self.low) / self.width
-            k = np.floor(t + EDGE)
-            if self.periodic:
-                return np.asarray(turns * self.cells + k)
-            last = (k >= self.cells) & ((t - self.cells <= EDGE) | (x <= self.high))
-            k = np.where(last, self.cells - 1.0, k)
-            inside = np.isfinite(x) & (k >= 0.0) & (k < self.cells)
-        return np.where(inside, k, np.nan)
+        image = np.asarray(image, dtype=np.float64)
+        flat, found = fixed(np.ascontiguousarray(image).reshape(-1)), np.zeros(image.size)
+        if self.periodic:
+            turned(flat, self.low, self.high, self.width, self.cells, found)
+        else:
+            interval(flat, self.low, self.high, self.width, self.cells, 1.0, clip, found)
+        return found.reshape(image.shape)
 
     @property
     def margin(self) -> float:
@@ -113,6 +110,24 @@ def on_circle(x, low, high, width, cells):  # type: ignore[no-untyped-def]
     k = np.floor((x - low) / width + EDGE)
     k = k if k < cells else 0.0
     return k if abs(turns) <= MOST_TURNS else np.nan
+
+
+@kernel
+def turned(image, low, high, width, cells, index):  # type: ignore[no-untyped-def]
+    """Fill in the indices on a circle before the modulus; every turn adds ``cells``."""
+    span = high - low
+    for i in range(len(image)):
+        x, away = image[i], image[i] - low
+        home = (x >= low) & (x <= high)
+        turns = np.floor(away / span)
+        rest = away - turns * span
+        rest = rest if rest > 0.0 else 0.0
+        rest = rest if rest < span else span
+        wrapped = low + rest
+        wrapped = wrapped if wrapped < high else high
+        k = np.floor(((x if home else wrapped) - low) / width + EDGE)
+        k = k if home else turns * cells + k
+        index[i] = k if home | (abs(turns) <= MOST_TURNS) else np.nan
 
 
 @kernel

@@ -111,6 +111,25 @@ def judge(judged, first, last, out, way, state):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def join(first, last, circle, least, most):  # type: ignore[no-untyped-def]
+    """Fill in the hulls of pieces, of shape (ranges, pieces, others), NaN where one is.
+
+    On a circle of so many cells a piece is turned next to those before; 0: it is none.
+    """
+    for r in range(len(first)):
+        for i in range(first.shape[2]):
+            a, b = first[r, 0, i], last[r, 0, i]
+            for p in range(1, first.shape[1]):
+                x, y = first[r, p, i], last[r, p, i]
+                if circle > 0.0:
+                    turn = np.rint((a + b - x - y) / (2.0 * circle)) * circle
+                    x, y = x + turn, y + turn
+                a = a if (a < x) | (a != a) else x
+                b = b if (b > y) | (b != b) else y
+            least[r, i], most[r, i] = a, b
+
+
+@kernel
 def hulls(pairs, first, last, least, most):  # type: ignore[no-untyped-def]
     """Fill in the hulls of all ranges of every cell, shape (cells, 1, d)."""
     for i in range(len(least)):

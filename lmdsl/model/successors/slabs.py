@@ -16,9 +16,11 @@ from lmdsl.common.types import Bools, Floats
 from lmdsl.formulas.intervals import Interval
 from lmdsl.formulas.program import Program
 from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.kernels import fixed
 from lmdsl.model.discretization import control_vectors, offsets
 from lmdsl.model.grid.axis import AxisCells
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.successors import counting
 from lmdsl.model.successors.assumed import encloser_of
 from lmdsl.model.successors.compiled.stretches import CompiledEncloser
 from lmdsl.model.successors.domains import Domain, domains
@@ -173,14 +175,13 @@ class Slabs:
         ``axis`` is that on which the ranges lie.
         """
         positions = len(self.domains[k].positions(*block.spans[k]))
-        first, last = span
-        if first.shape[k] == 1 and positions * self.pieces[k] > 1:
+        shape = span[0].shape
+        if shape[k] == 1 and positions * self.pieces[k] > 1:
             return span  # it does not depend on the place
-        shape = (*first.shape[:k], positions, self.pieces[k], *first.shape[k + 1 :])
-        first, last = first.reshape(shape), last.reshape(shape)
-        ends = _part((first, last), k + 1, 0)
-        for piece in range(1, self.pieces[k]):
-            ends = union(ends, _part((first, last), k + 1, piece), axis)
+        ends = span
+        if self.pieces[k] > 1:
+            flat = (math.prod(shape[:k]) * positions, self.pieces[k], math.prod(shape[k + 1 :]))
+            ends = _hull(span, flat, axis, (*shape[:k], positions, *shape[k + 1 :]))
         cells = block.spans[k][1] - block.spans[k][0]
         if positions == cells:
             return ends
@@ -197,6 +198,17 @@ def _most(x: Floats) -> float:
     """Return what all but a few are below, infinite numbers among them."""
     ordered = np.sort(np.ravel(x))
     return float(ordered[math.ceil(SHARE * len(ordered)) - 1])
+
+
+def _hull(
+    span: Span, pieces: tuple[int, int, int], axis: AxisCells | None, shape: tuple[int, ...]
+) -> Span:
+    """Return what holds all pieces, the middle of three axes; on a circle turned next to others."""
+    first, last = (fixed(np.ascontiguousarray(end).reshape(pieces)) for end in span)
+    least, most = (np.empty((pieces[0], pieces[2])) for _ in range(2))
+    circle = axis.cells if axis is not None and axis.periodic else 0.0
+    counting.join(first, last, circle, least, most)
+    return least.reshape(shape), most.reshape(shape)
 
 
 def _part(span: Span, axis: int, where: int | slice) -> Span:
