@@ -13,7 +13,7 @@ import numpy as np
 from lmdsl.common.types import Floats, Indices
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import kernel
-from lmdsl.model.successors.compiled.places import BITS, LAST, MAY_LEAVE
+from lmdsl.model.successors.compiled.places import BITS, LAST, MAY_ARRIVE, MAY_LEAVE
 from lmdsl.problem.noise import NoiseNormal
 from lmdsl.problem.problem import Problem
 from lmdsl.proof.cover import Cover
@@ -156,8 +156,11 @@ def value(search, more, chance, b, weight):  # type: ignore[no-untyped-def]
         least = 1.0
         for i in range(tree.first[b] + j * pieces, tree.first[b] + (j + 1) * pieces):
             image = search.places[i]
-            if (more[i] & MAY_LEAVE) | (image[0, 0] > image[0, 1]):
+            nowhere = image[0, 0] > image[0, 1]  # it is absorbed on the way, or has left the box
+            if (more[i] & MAY_LEAVE) | (nowhere & (more[i] & MAY_ARRIVE == 0)):
                 least = 0.0
+            elif nowhere:
+                continue
             elif least > 0.0:
                 least = _least(search, image, chance, least)
         total += weight[j] * least

@@ -76,7 +76,7 @@ class BoxImages:
 
     def __call__(self, cell: Integers, split: Integers, place: Integers) -> Seen:
         """Return what is known of the images of nodes; several threads work."""
-        arcs = 2 * self.partition.dimension * self.step.substeps
+        arcs = 2 * sum(self.step.sizes[:2]) * self.step.substeps
         size = max(64, min(SOME, KEPT // arcs))
         starts = range(0, len(cell), size)
 
@@ -129,6 +129,7 @@ class BoxImages:
             places.locate_images(found.low, found.high, self.axes, clip, self.slack, image, flags)
             if self.step.path:
                 places.follow(found, boxes.start, self.ground, flags)
+                places.absorb(found, boxes.start, self.ground, self.slack, flags)
         image[(flags & places.EMPTY) > 0] = (1, 0)  # nothing of it is in the box
         return image, flags & ~np.uint8(places.EMPTY)
 
@@ -138,8 +139,9 @@ class BoxImages:
         d = self.partition.dimension
         if found.low.shape[1] > d:  # of a rate, paid only until A is entered
             early = (flags & places.MAY_ARRIVE) > 0
+            least, most = enclosing.paid(found, d)
             low, high = found.low[:, d], found.high[:, d]
-            return np.where(early, np.minimum(low, 0.0), low), high
+            return np.where(early, least, low), np.where(early, most, high)
         low, high = enclosing.ranges(self.step, self.step.cost, given)
         return low[:, 0], high[:, 0]
 

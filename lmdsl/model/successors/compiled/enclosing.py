@@ -42,6 +42,9 @@ class Enclosed(NamedTuple):
         Ends of what holds the ways from the start to the control points of the first arc, and of
         what holds the way to its end, shape (B, d, 4). Where the first do not hold 0, the arc
         leaves the start in one direction.
+    knots
+        Ends of all components at the ends of substeps where the path is judged, shape
+        (B, arcs, m, 2).
     middle, slope
         Where asked for: ends of what holds the images of centres and all that rounds, and of what
         holds the slopes in between, shapes (B, m, 2) and (B, m, d, 2): the image of x lies in
@@ -53,6 +56,7 @@ class Enclosed(NamedTuple):
     stretch: Floats
     arcs: Floats
     way: Floats
+    knots: Floats
     middle: Floats
     slope: Floats
 
@@ -83,7 +87,7 @@ def enclose(step: Step, given: Given, held: Room | None = None, sloped: bool = F
     found = Enclosed(
         np.empty((count, m)), np.empty((count, m)), np.empty((count, m, d)),
         np.empty((count, arcs, d, 2)), np.empty((count, d if step.path else 0, 4)),
-        np.empty((some, m, 2)), np.empty((some, m, d, 2)),
+        np.empty((count, arcs, m, 2)), np.empty((some, m, 2)), np.empty((some, m, d, 2)),
     )  # fmt: skip
     with np.errstate(all="ignore"):
         _enclose(step, given, rows(step) if held is None else held, found)
@@ -91,6 +95,17 @@ def enclose(step: Step, given: Given, held: Room | None = None, sloped: bool = F
         gone = ranges(step, step.nowhere, given)[0][:, 0] > 0.0
         found.low[gone, :d] = found.high[gone, :d] = found.arcs[gone] = np.nan
     return found
+
+
+def paid(found: Enclosed, d: int) -> tuple[Floats, Floats]:
+    """Return ends of the integral of a cost rate until any time on the way, shape (B,).
+
+    The integral until then lies between those at the ends of its arc, which are kept in order.
+    """
+    if not found.knots.shape[1]:
+        return found.low[:, d], found.high[:, d]
+    at_ends = found.knots[:, :, d]
+    return np.minimum(at_ends[..., 0].min(axis=1), 0.0), at_ends[..., 1].max(axis=1)
 
 
 def ranges(step: Step, tapes: Tapes, given: Given) -> tuple[Floats, Floats]:
@@ -225,6 +240,8 @@ def _knot(found, step, held, at, s):  # type: ignore[no-untyped-def]
         mean_values(t, rows, out, middle[tapes.middle[k]], away)
         for i in range(count):
             found.low[at + i, k], found.high[at + i, k] = t[0, i], t[1, i]
+        for i in range(count if step.path else 0):
+            found.knots[at + i, s, k, 0], found.knots[at + i, s, k, 1] = t[0, i], t[1, i]
         if step.path and k < d:
             for i in range(count):
                 _extend(found.arcs, at + i, s, k, t[0, i], t[1, i], False)

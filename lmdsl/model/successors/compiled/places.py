@@ -106,24 +106,82 @@ def follow(found, start, ground, flags):  # type: ignore[no-untyped-def]
 
     ``start`` has the cells of the starts before the modulus, shape (B, d).
     """
-    axes, kind, clip, tolerance = ground
-    d = len(axes)
-    first, last = np.empty(d), np.empty(d)
+    room = np.empty((2, len(ground[0])))
     for b in range(len(flags)):
         for s in range(found.arcs.shape[1]):
-            if np.isnan(found.arcs[b, s, 0, 0]):
-                flags[b] |= MAY_LEAVE
-                continue
-            for k in range(d):
-                low, high = found.arcs[b, s, k, 0], found.arcs[b, s, k, 1]
-                error = tolerance * max(abs(low), abs(high))
-                first[k], last[k] = number(low - error, axes[k]), number(high + error, axes[k])
-                if s == 0:  # by MOST_PARTS parts of an arc, and t (3 - 3 t + t t) >= t
-                    if found.way[b, k, 0] > 2000.0 * error:
-                        first[k] = max(first[k], start[b, k])
-                    if found.way[b, k, 1] < -2000.0 * error:
-                        last[k] = min(last[k], start[b, k])
-            flags[b] |= crossed(first, last, axes, kind, clip)
+            flags[b] |= _on_arc(found, start, ground, room, b, s)
+
+
+@kernel
+def _on_arc(found, start, ground, room, b, s):  # type: ignore[no-untyped-def]
+    """Return what an image may do on arc s of its way."""
+    axes, kind, clip, tolerance = ground
+    first, last = room
+    if np.isnan(found.arcs[b, s, 0, 0]):
+        return MAY_LEAVE
+    for k in range(len(axes)):
+        low, high = found.arcs[b, s, k, 0], found.arcs[b, s, k, 1]
+        error = tolerance * max(abs(low), abs(high))
+        first[k], last[k] = number(low - error, axes[k]), number(high + error, axes[k])
+        if s == 0:  # by MOST_PARTS parts of an arc, and t (3 - 3 t + t t) >= t
+            if found.way[b, k, 0] > 2000.0 * error:
+                first[k] = max(first[k], start[b, k])
+            if found.way[b, k, 1] < -2000.0 * error:
+                last[k] = min(last[k], start[b, k])
+    return crossed(first, last, axes, kind, clip)
+
+
+@kernel(allocates=True)
+def absorb(found, start, ground, slack, flags):  # type: ignore[no-untyped-def]
+    """Give images that surely enter the attractor on the way the flags of an absorbed one.
+
+    They do where a substep ends in attractor cells only: at its end the path is judged. What would
+    become of them after it does not matter.
+    """
+    axes, kind, _, _ = ground
+    room = np.empty((2, len(axes)))
+    for b in range(len(flags)):
+        until = MAY_ARRIVE | EMPTY
+        for s in range(found.knots.shape[1] if flags[b] & MAY_ARRIVE else 0):
+            until |= _on_arc(found, start, ground, room, b, s)
+            if _arrived(found.knots[b, s], axes, kind, slack, room):
+                flags[b] = until
+                break
+
+
+MOST_CELLS = 256  # cells above which a substep is not said to end in the attractor
+
+
+@kernel
+def _arrived(knot, axes, kind, slack, room):  # type: ignore[no-untyped-def]
+    """Return whether a substep ends in attractor cells only."""
+    first, last = room
+    count = 1.0
+    for k in range(len(axes)):
+        low, high = knot[k, 0] - slack * axes[k, 2], knot[k, 1] + slack * axes[k, 2]
+        first[k], last[k] = number(low, axes[k]), number(high, axes[k])
+        inside = (axes[k, 5] > 0.0) | ((first[k] >= 0.0) & (last[k] < axes[k, 3]))
+        if not (inside & (last[k] - first[k] < axes[k, 3])):
+            return False
+        count *= last[k] - first[k] + 1.0
+    if not count <= MOST_CELLS:
+        return False
+    others = 0
+    for j in range(np.int64(count)):
+        others += kind[_numbered(j, first, last, axes)] != MAY_ARRIVE
+    return others == 0
+
+
+@kernel
+def _numbered(j, first, last, axes):  # type: ignore[no-untyped-def]
+    """Return the index of the j-th cell between two."""
+    rest, cell = np.int64(j), 0.0
+    for k in range(len(axes)):
+        size = np.int64(last[k] - first[k] + 1.0)
+        at = first[k] + rest % size
+        rest //= size
+        cell += axes[k, 4] * (at - np.floor(at / axes[k, 3]) * axes[k, 3])
+    return np.int64(cell)
 
 
 MOST_CROSSED = 100_000  # cells above which an arc is said to meet anything
@@ -148,11 +206,5 @@ def crossed(first, last, axes, kind, clip):  # type: ignore[no-untyped-def]
     if not count <= MOST_CROSSED:
         return MAY_LEAVE | MAY_ARRIVE
     for j in range(np.int64(count)):
-        rest, cell = np.int64(j), 0.0
-        for k in range(len(axes)):
-            size = np.int64(last[k] - first[k] + 1.0)
-            at = first[k] + rest % size
-            rest //= size
-            cell += axes[k, 4] * (at - np.floor(at / axes[k, 3]) * axes[k, 3])
-        flags |= kind[np.int64(cell)]
+        flags |= kind[_numbered(j, first, last, axes)]
     return flags
