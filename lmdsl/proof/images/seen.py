@@ -139,7 +139,7 @@ class BoxImages:
         d = self.partition.dimension
         if found.low.shape[1] > d:  # of a rate, paid only until A is entered
             early = (flags & places.MAY_ARRIVE) > 0
-            least, most = enclosing.paid(found, d)
+            least, most = places.paid(found, d)
             low, high = found.low[:, d], found.high[:, d]
             return np.where(early, least, low), np.where(early, most, high)
         low, high = enclosing.ranges(self.step, self.step.cost, given)

@@ -97,17 +97,6 @@ def enclose(step: Step, given: Given, held: Room | None = None, sloped: bool = F
     return found
 
 
-def paid(found: Enclosed, d: int) -> tuple[Floats, Floats]:
-    """Return ends of the integral of a cost rate until any time on the way, shape (B,).
-
-    The integral until then lies between those at the ends of its arc, which are kept in order.
-    """
-    if not found.knots.shape[1]:
-        return found.low[:, d], found.high[:, d]
-    at_ends = found.knots[:, :, d]
-    return np.minimum(at_ends[..., 0].min(axis=1), 0.0), at_ends[..., 1].max(axis=1)
-
-
 def ranges(step: Step, tapes: Tapes, given: Given) -> tuple[Floats, Floats]:
     """Enclose numbers that depend on states, controls and noise, shape (B, outputs) each."""
     shape = (len(given.low), len(tapes.middle))

@@ -7,10 +7,11 @@ place, with a margin for the rounding of the state. Boxes are ranges of places, 
 what is decided without rounding.
 """
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
+from lmdsl.common.types import Floats
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.axis import EDGE, MOST_TURNS, ROUNDING
 
@@ -208,3 +209,14 @@ def crossed(first, last, axes, kind, clip):  # type: ignore[no-untyped-def]
     for j in range(np.int64(count)):
         flags |= kind[_numbered(j, first, last, axes)]
     return flags
+
+
+def paid(found: Any, d: int) -> tuple[Floats, Floats]:
+    """Return ends of the integral of a cost rate until any time on the way, shape (B,).
+
+    The integral until then lies between those at the ends of its arc, which are kept in order.
+    """
+    if not found.knots.shape[1]:
+        return found.low[:, d], found.high[:, d]
+    at_ends = found.knots[:, :, d]
+    return np.minimum(at_ends[..., 0].min(axis=1), 0.0), at_ends[..., 1].max(axis=1)

@@ -131,7 +131,7 @@ class Flights:
     def _cost(self, given: enclosing.Given, found: enclosing.Enclosed) -> Floats:
         d = self.loop.partition.dimension
         if found.low.shape[1] > d:
-            return np.maximum(found.high[:, d], enclosing.paid(found, d)[1])
+            return np.maximum(found.high[:, d], places.paid(found, d)[1])
         return enclosing.ranges(self.step, self.step.cost, given)[1][:, 0]
 
 
