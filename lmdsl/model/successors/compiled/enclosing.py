@@ -37,14 +37,13 @@ class Enclosed(NamedTuple):
     stretch
         How far a side of the box moves each component of the image, shape (B, m, d).
     arcs
-        Ends of what holds each arc of the path, shape (B, arcs, d, 2).
+        Ends of what holds each arc of the path that is judged, shape (B, arcs, d, 2).
     way
         Ends of what holds the ways from the start to the control points of the first arc, and of
         what holds the way to its end, shape (B, d, 4). Where the first do not hold 0, the arc
         leaves the start in one direction.
     knots
-        Ends of all components at the ends of substeps where the path is judged, shape
-        (B, arcs, m, 2).
+        Ends of all components at ends of arcs, (B, arcs, m, 2).
     middle, slope
         Where asked for: ends of what holds the images of centres and all that rounds, and of what
         holds the slopes in between, shapes (B, m, 2) and (B, m, d, 2): the image of x lies in
