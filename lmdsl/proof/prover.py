@@ -133,10 +133,11 @@ class Prover:
 
     def room(self, bisected: int) -> bool:
         """Return whether there is memory to bisect so many leaves, arrays made anew included."""
-        cover = self.cover
-        if cover.count + 2 * bisected <= len(cover.tree.cell) and cover.used < len(cover.places):
+        cover, parts = self.cover, len(self.images.noise[0])
+        images = cover.used + 4 * bisected * parts  # two each at the seam of a circle
+        if cover.count + 2 * bisected <= len(cover.tree.cell) and images <= len(cover.places):
             return True  # none is needed
-        each = node_bytes(cover.partition.dimension, len(self.images.noise[0]))
+        each = node_bytes(cover.partition.dimension, parts)
         return memory.fits(2.0 * each * (2 * bisected + cover.count))
 
     def undecided(self, leaves: Indices) -> Indices:
