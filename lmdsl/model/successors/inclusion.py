@@ -1,9 +1,10 @@
 """Whether all that the pairs of a policy can meet lies in C u A, checked anew.
 
 Nothing of what compiling found is used, nor the compiled loops that found it: arrays of intervals
-judge them, which is fast enough for one control a cell. The cell of a pair is one box, cut in two where its
-enclosure does not decide, first along the axes along which compiling cuts: what that could show is
-shown here as well. A cell is given up where the image of the middle of a box is not allowed.
+judge them, which is fast enough for one control a cell. The cell of a pair is one box, cut in two
+where its enclosure does not decide, first along the axes along which compiling cuts: what that
+could show is shown here as well. A cell is given up where the image of the middle of a box is not
+allowed.
 """
 
 from typing import Any, NamedTuple
