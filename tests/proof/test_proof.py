@@ -226,6 +226,17 @@ def test_without_an_attractor_staying_is_the_target():
     assert "stays in A" not in str(proof)
 
 
+def test_a_cost_without_bounds_is_kept(tmp_path):
+    """Of a pole between samples nothing is known of the cost; what arrives still does."""
+    data = line("0.5*x", stage_cost="1/(x - 0.31)**3 + 1e6", attractor={"cells": [[0]]})
+    result, proof = proved(data, target=0.9)
+    assert proof.arrives == 1
+    assert proof.cost == (-np.inf, np.inf)
+    result.save(tmp_path / "out")
+    add(tmp_path / "out", result, proof)
+    assert lm.verify(tmp_path / "out").holds
+
+
 def test_the_cost_of_a_killed_chain_counts_the_discount():
     data = line("0.125 + 0.25*floor(4*x - 1)", discount=0.5, gamma=1.0)
     result, proof = proved(data, target=0.9)

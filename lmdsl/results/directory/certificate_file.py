@@ -3,7 +3,6 @@
 Beside them stand ``save`` and ``files``, which hold the files of a save together (reading.py).
 """
 
-import math
 from dataclasses import MISSING, fields
 from typing import Annotated, Any, Literal, Self, TypeVar, get_type_hints
 
@@ -31,11 +30,11 @@ def scope(problem: Problem) -> str:
 T = TypeVar("T")
 Word = Annotated[T, Field(strict=False)]  # a member of an enum, by its value
 List = Annotated[tuple[T, ...], BeforeValidator(plain)]
-# A number, or ``"inf"``.
+# A number, ``"inf"`` or ``"-inf"``.
 Bound = Annotated[
     float,
     Field(allow_inf_nan=True),
-    BeforeValidator(lambda value: math.inf if value == "inf" else value),
+    BeforeValidator(lambda value: float(value) if value in ("inf", "-inf") else value),
 ]
 
 
