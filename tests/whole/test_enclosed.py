@@ -233,6 +233,42 @@ def test_an_aircraft_lands_from_where_a_growth_bound_lands_it(part):
     print(f"sure {result.sure_cells}, growth bound {won.sum()}")
 
 
+def won_by_corners(partition, target, controls):
+    """The most cells that can be won: of each, all corners are, a millionth inside of it."""
+    rate = made(AIRCRAFT).step().field
+    side = np.array(list(np.ndindex(2, 2, 2))) - 0.5
+    x = partition.centres(np.arange(partition.size))[:, None] + (1 - 1e-6) * side * partition.width
+    x = np.moveaxis(x, -1, 0)
+    images = []
+    for T, al in controls:
+        end = stepped(
+            lambda x, u=(T, al): np.array(
+                rate(dict(zip(("V", "g", "h", "T", "al"), (*x, *u), strict=True)))
+            ),
+            x,
+        )
+        images.append(partition.locate(list(end)))
+    won = np.append(target, False)  # the last: outside
+    while True:
+        more = won.copy()
+        for image in images:
+            more[:-1] |= won[image].all(axis=-1)
+        if (more == won).all():
+            return won[:-1] & ~target
+        won = more
+
+
+@pytest.mark.parametrize(
+    "part",
+    [((17, 20, 0), (62, 33, 8)), pytest.param(((0, 0, 0), (91, 33, 84)), marks=pytest.mark.long)],
+)
+def test_no_other_cell_can_surely_be_won(part):
+    """Of every other one a corner loses under each control. (SCOTS is recorded with 169 cells.)"""
+    lp = lm.compile(made(landing(*part)))
+    won = won_by_corners(lp.partition, lp.cell_status == 0, lp.controls)
+    np.testing.assert_array_equal(won, lp.sure_levels > 0)
+
+
 @pytest.mark.long
 def test_an_aircraft_lands_along_its_path():
     data = landing((0, 0, 0), (91, 33, 84))
