@@ -108,6 +108,7 @@ def test_paths(name, monkeypatch):
 
 
 @pytest.mark.long
+@pytest.mark.full
 @settings(
     max_examples=300, deadline=None, derandomize=True,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much,

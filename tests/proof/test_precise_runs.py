@@ -145,6 +145,7 @@ def test_states_of_an_equation_do_as_is_proved():
 
 
 @pytest.mark.long
+@pytest.mark.full
 @pytest.mark.parametrize("name", [*MAPS, *EQUATIONS])
 def test_ten_thousand_of_them_do(name):
     assert follow(name, ARRIVES, 10_000) == (10_000, 0)

@@ -137,6 +137,7 @@ def test_runs_find_out_what_is_not_enclosed(monkeypatch, module, name, spoilt):
 
 
 @pytest.mark.long
+@pytest.mark.full
 def test_what_is_proved_happens_in_many_loops():
     """For an hour: ``follow(1, 10_000, 6_000)``."""
     shares = follow(1, 50, 3_000)

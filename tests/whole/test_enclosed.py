@@ -85,6 +85,7 @@ def test_a_small_maze(judged):
 
 
 @pytest.mark.long
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("name", "sure", "kept"), [("maze", 48_018, 53_000), ("planning", 19_563, 19_563)]
 )
@@ -111,7 +112,10 @@ def test_published_problems(name, sure, kept):
 
 @pytest.mark.parametrize(
     ("cells", "kill", "runs"),
-    [(80, 0.01, 20_000), pytest.param(799, 0.01, 100_000, marks=pytest.mark.long)],
+    [
+        (80, 0.01, 20_000),
+        pytest.param(799, 0.01, 100_000, marks=[pytest.mark.long, pytest.mark.full]),
+    ],
 )
 def test_safety_of_the_boost_converter(cells, kill, runs):
     """The published safety of a DC-DC converter, killed at random; also on coarser cells."""
@@ -218,7 +222,10 @@ def stepped(rate, x, h=0.25):
 
 @pytest.mark.parametrize(
     "part",
-    [((17, 20, 0), (62, 33, 8)), pytest.param(((0, 0, 0), (91, 33, 84)), marks=pytest.mark.long)],
+    [
+        ((17, 20, 0), (62, 33, 8)),
+        pytest.param(((0, 0, 0), (91, 33, 84)), marks=[pytest.mark.long, pytest.mark.full]),
+    ],
 )
 def test_an_aircraft_lands_from_where_a_growth_bound_lands_it(part):
     data = landing(*part)
@@ -260,7 +267,10 @@ def won_by_corners(partition, target, controls):
 
 @pytest.mark.parametrize(
     "part",
-    [((17, 20, 0), (62, 33, 8)), pytest.param(((0, 0, 0), (91, 33, 84)), marks=pytest.mark.long)],
+    [
+        ((17, 20, 0), (62, 33, 8)),
+        pytest.param(((0, 0, 0), (91, 33, 84)), marks=[pytest.mark.long, pytest.mark.full]),
+    ],
 )
 def test_no_other_cell_can_surely_be_won(part):
     """Of every other one a corner loses under each control. (SCOTS is recorded with 169 cells.)"""
@@ -270,6 +280,7 @@ def test_no_other_cell_can_surely_be_won(part):
 
 
 @pytest.mark.long
+@pytest.mark.full
 def test_an_aircraft_lands_along_its_path():
     data = landing((0, 0, 0), (91, 33, 84))
     result = lm.solve(made({**data, "system": {**data["system"], "judged": "path"}}))

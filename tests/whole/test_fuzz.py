@@ -58,6 +58,7 @@ def test_spoiled_problem_files(folder, seed):
 
 
 @pytest.mark.long
+@pytest.mark.full
 @settings(max_examples=2000, deadline=None, derandomize=True)
 @given(seed=st.integers(2**41, 2**50))
 def test_spoiled_problem_files_at_length(folder, seed):

@@ -207,6 +207,7 @@ def test_spoiled_results(folder, saved, seed):
 
 
 @pytest.mark.long
+@pytest.mark.full
 @settings(max_examples=600, deadline=None, derandomize=True)
 @given(seed=st.integers(2**41, 2**50))
 def test_spoiled_results_at_length(folder, saved, seed):

@@ -72,6 +72,7 @@ def test_a_pendulum():
 
 
 @pytest.mark.long
+@pytest.mark.full
 @pytest.mark.parametrize("cells", [400, 1_000])
 def test_a_boost_converter_at_length(cells):
     result = reached_and_held(converter(cells), 100_000, 0.93)
@@ -83,6 +84,7 @@ def test_a_boost_converter_at_length(cells):
 
 
 @pytest.mark.long
+@pytest.mark.full
 def test_a_pendulum_along_its_path():
     result = reached_and_held(pendulum(128), 100_000, 0.93)
     assert result.sure_cells == result.stabilizable_cells
