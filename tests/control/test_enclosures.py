@@ -33,7 +33,7 @@ def test_plain_formulas_also_over_the_rationals():
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(2, 4))
 def test_many_computed_values_lie_in_the_enclosure(seed):
-    """For an hour: ``hammer(seed, 10**6, 800)``."""
+    """Longer: ``hammer(seed, 10**6, 800)``."""
     assert hammer(seed, 1200, 800, plain=seed % 2 == 1)[0] > 400_000
 
 
