@@ -21,7 +21,7 @@ from lmdsl.proof.bounds.flights.following import Flights
 from lmdsl.proof.bounds.flights.refining import SLACK, Above, refine
 from lmdsl.proof.bounds.optimum.averages import means
 from lmdsl.proof.bounds.optimum.bracket import bound
-from lmdsl.proof.bounds.optimum.moves import Parts
+from lmdsl.proof.bounds.optimum.parts import Parts
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.search import UNDECIDED
 from lmdsl.results.directory.proved import loop_of

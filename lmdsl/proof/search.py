@@ -114,29 +114,47 @@ def meet(search, b, until):  # type: ignore[no-untyped-def]
 
 @kernel
 def _meet_cells(search, image, until, met):  # type: ignore[no-untyped-def]
-    first, last, at, low, high = search.odometer
-    d = len(search.cells)
-    for k in range(d):
-        first[k], last[k] = image[k, 0] >> BITS, image[k, 1] >> BITS
-        at[k] = first[k]
+    enter(search, image)
     while True:
-        root = 0
-        for k in range(d):
-            low[k] = image[k, 0] & LAST if at[k] == first[k] else 0
-            high[k] = image[k, 1] & LAST if at[k] == last[k] else LAST
-            root += (at[k] % search.cells[k]) * search.stride[k]
-        met = _descend(search, root, until, met)
+        met = _descend(search, root(search, image), until, met)
         if (met.bits & MEETS_UNDECIDED) and until != EVERY:
             return met
-        k = d - 1
-        while k >= 0:
-            at[k] += 1
-            if at[k] <= last[k]:
-                break
-            at[k] = first[k]
-            k -= 1
-        if k < 0:
+        if not onward(search):
             return met
+
+
+@kernel
+def enter(search, image):  # type: ignore[no-untyped-def]
+    """Begin with the first cell that an image meets."""
+    first, last, at = search.odometer[0], search.odometer[1], search.odometer[2]
+    for k in range(len(search.cells)):
+        first[k], last[k] = image[k, 0] >> BITS, image[k, 1] >> BITS
+        at[k] = first[k]
+
+
+@kernel
+def root(search, image):  # type: ignore[no-untyped-def]
+    """Return the node of the cell, and fill in the range of places within it."""
+    first, last, at, low, high = search.odometer
+    found = np.int64(0)
+    for k in range(len(search.cells)):
+        low[k] = image[k, 0] & LAST if at[k] == first[k] else 0
+        high[k] = image[k, 1] & LAST if at[k] == last[k] else LAST
+        cell, cells = at[k], search.cells[k]
+        found += (cell - cells if cell >= cells else cell) * search.stride[k]
+    return found
+
+
+@kernel
+def onward(search):  # type: ignore[no-untyped-def]
+    """Go on to the next cell; return whether there is one."""
+    first, last, at = search.odometer[0], search.odometer[1], search.odometer[2]
+    for k in range(len(search.cells) - 1, -1, -1):
+        at[k] += 1
+        if at[k] <= last[k]:
+            return True
+        at[k] = first[k]
+    return False
 
 
 @kernel

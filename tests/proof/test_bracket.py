@@ -18,7 +18,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import proving
 from lmdsl.proof.bounds.flights import refining
 from lmdsl.proof.bounds.optimum import bracket, checking
-from lmdsl.proof.bounds.optimum.moves import Parts
+from lmdsl.proof.bounds.optimum.parts import Parts
 from lmdsl.results.directory.proved import loop_of
 
 

@@ -17,7 +17,7 @@ from lmdsl.model.successors.compiled import enclosing, tapes
 from lmdsl.proof import proving
 from lmdsl.proof.bounds.flights import affine, checking, refining
 from lmdsl.proof.bounds.flights.following import Flights
-from lmdsl.proof.bounds.optimum.moves import Parts
+from lmdsl.proof.bounds.optimum.parts import Parts
 from lmdsl.results.directory.proved import loop_of
 
 PENDULUM = {

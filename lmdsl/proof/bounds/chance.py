@@ -13,12 +13,12 @@ import numpy as np
 from lmdsl.common.types import Floats, Indices
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import kernel
-from lmdsl.model.successors.compiled.places import BITS, LAST, MAY_ARRIVE, MAY_LEAVE
+from lmdsl.model.successors.compiled.places import BITS, MAY_ARRIVE, MAY_LEAVE
 from lmdsl.problem.noise import NoiseNormal
 from lmdsl.problem.problem import Problem
 from lmdsl.proof.cover import Cover
 from lmdsl.proof.prover import Prover
-from lmdsl.proof.search import ARRIVES, depth, inside
+from lmdsl.proof.search import ARRIVES, depth, enter, inside, onward, root
 
 KEPT = 1.0 - 2.0**-30  # what is left of a probability a step, when it is proved
 CHECKED = 1.0 - 2.0**-31  # and when it is checked
@@ -123,27 +123,11 @@ def _sink(search, n, chance, least):  # type: ignore[no-untyped-def]
 @kernel
 def _least(search, image, chance, least):  # type: ignore[no-untyped-def]
     """Return the least chance of what an image meets, or ``least``."""
-    first, last, at, low, high = search.odometer
-    d = len(search.cells)
-    for k in range(d):
-        first[k], last[k] = image[k, 0] >> BITS, image[k, 1] >> BITS
-        at[k] = first[k]
-    while least > 0.0:
-        root = np.int64(0)
-        for k in range(d):
-            low[k] = image[k, 0] & LAST if at[k] == first[k] else 0
-            high[k] = image[k, 1] & LAST if at[k] == last[k] else LAST
-            root += (at[k] % search.cells[k]) * search.stride[k]
-        least = _sink(search, root, chance, least)
-        k = d - 1
-        while k >= 0:
-            at[k] += 1
-            if at[k] <= last[k]:
-                break
-            at[k] = first[k]
-            k -= 1
-        if k < 0:
-            break
+    enter(search, image)
+    more = True
+    while more & (least > 0.0):
+        least = _sink(search, root(search, image), chance, least)
+        more = onward(search)
     return least
 
 

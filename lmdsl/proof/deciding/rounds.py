@@ -9,7 +9,7 @@ that was found is noted, in order. So nothing depends on the number of threads.
 import numpy as np
 
 from lmdsl.machine.kernels import kernel
-from lmdsl.model.successors.compiled.places import BITS, LAST, MAY_ARRIVE, MAY_LEAVE
+from lmdsl.model.successors.compiled.places import BITS, MAY_ARRIVE, MAY_LEAVE
 from lmdsl.proof.search import (
     ARRIVES,
     EVERY,
@@ -19,7 +19,10 @@ from lmdsl.proof.search import (
     STAYS,
     UNDECIDED,
     depth,
+    enter,
     meet,
+    onward,
+    root,
 )
 
 AXES = 16  # one more than the number of the last axis: a way is child * AXES + axis
@@ -110,8 +113,7 @@ def _sink(way, n, low, high, stack, bits):  # type: ignore[no-untyped-def]
 @kernel
 def look(search, b):  # type: ignore[no-untyped-def]
     """Return an undecided leaf that the images of a node meet; without one -1 less what is met."""
-    tree, d = search.tree, len(search.cells)
-    first, last, at, low, high = search.odometer
+    tree = search.tree
     packed, bits, leaf = tree.way[b, 1], 0, np.int64(-1)
     flags, count, start = packed & ((1 << KNOWN) - 1), (packed >> KNOWN) % MANY, packed >> KNOWN
     start //= MANY
@@ -123,28 +125,14 @@ def look(search, b):  # type: ignore[no-untyped-def]
         image = search.places[j]
         if image[0, 0] > image[0, 1]:
             continue  # nothing of it is in the box
-        for k in range(d):
-            first[k], last[k] = image[k, 0] >> BITS, image[k, 1] >> BITS
-            at[k] = first[k]
-        while bits & (bits - 1) == 0:
-            root = np.int64(0)
-            for k in range(d):
-                low[k] = image[k, 0] & LAST if at[k] == first[k] else 0
-                high[k] = image[k, 1] & LAST if at[k] == last[k] else LAST
-                cell, cells = at[k], search.cells[k]
-                root += (cell - cells if cell >= cells else cell) * search.stride[k]
-            bits, leaf = _sink(tree.way, root, low, high, search.stack, bits)
+        enter(search, image)
+        more = True
+        while more & (bits & (bits - 1) == 0):
+            low, high = search.odometer[3], search.odometer[4]
+            bits, leaf = _sink(tree.way, root(search, image), low, high, search.stack, bits)
             if leaf >= 0:
                 return leaf
-            k = d - 1
-            while k >= 0:
-                at[k] += 1
-                if at[k] <= last[k]:
-                    break
-                at[k] = first[k]
-                k -= 1
-            if k < 0:
-                break
+            more = onward(search)
     return -1 - np.int64(bits)
 
 

@@ -13,7 +13,7 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof.bounds.flights.following import Flights, Upper
 from lmdsl.proof.bounds.flights.refining import DEEPEST, Above, begun
 from lmdsl.proof.bounds.optimum.averages import Arrays
-from lmdsl.proof.bounds.optimum.moves import Parts
+from lmdsl.proof.bounds.optimum.parts import Parts
 from lmdsl.proof.loop import Loop
 
 CUTS = 3  # times that parts are cut once more where their bound does not follow

@@ -18,7 +18,7 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.successors.compiled import enclosing, places
 from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.proof.bounds.flights.affine import Sets, advance, boxed
-from lmdsl.proof.bounds.optimum.moves import Parts
+from lmdsl.proof.bounds.optimum.parts import Parts
 from lmdsl.proof.images.pieces import Pieces, pieces
 from lmdsl.proof.loop import Loop
 

@@ -17,7 +17,7 @@ from lmdsl.machine.kernels import kernel
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof.bounds.flights.following import Flights, Upper
 from lmdsl.proof.bounds.optimum.averages import Arrays, volumes
-from lmdsl.proof.bounds.optimum.moves import Parts
+from lmdsl.proof.bounds.optimum.parts import Parts, one, whole
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.search import ARRIVES, UNDECIDED
 
@@ -163,21 +163,10 @@ def begun(flights: Flights, boxes: Arrays, parts: Parts) -> Upper:
 
 @kernel
 def _begin(split, index, place, cost, grid, known):  # type: ignore[no-untyped-def]
-    fine, stride = grid
-    d = len(fine)
     for b in range(len(split)):
-        count, first = 1, np.int64(0)
-        for k in range(d):
-            less = fine[k] - split[b, k]
-            at = place[b, k] >> -less if less < 0 else place[b, k] << less
-            first += ((index[b, k] << fine[k]) + at) * stride[k]
-            count *= np.int64(1) << max(less, 0)
+        first, count = whole(grid, split, place, index, b)
         for j in range(count):
-            rest, at = np.int64(j), first
-            for k in range(d - 1, -1, -1):
-                less = max(fine[k] - split[b, k], 0)
-                at += (rest & ((np.int64(1) << less) - 1)) * stride[k]
-                rest >>= less
+            at = one(grid, split, b, first, j)
             known[at] = max(known[at], cost[b])
 
 

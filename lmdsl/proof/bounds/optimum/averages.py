@@ -10,7 +10,7 @@ from lmdsl.common.types import Floats, Indices
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.partition import Partition
 from lmdsl.proof.bounds.optimum.bracket import Optimum
-from lmdsl.proof.bounds.optimum.moves import Parts
+from lmdsl.proof.bounds.optimum.parts import Parts, one, whole
 from lmdsl.proof.loop import Loop
 
 Arrays = dict[str, NDArray[Any]]
@@ -65,22 +65,9 @@ def means(split: Split, bound: NDArray[Any], partition: Partition, boxes: Arrays
 
 @kernel
 def _means(bound, grid, index, split, place, found):  # type: ignore[no-untyped-def]
-    fine, stride = grid
-    d = len(fine)
     for b in range(len(found)):
-        count, first = 1, np.int64(0)
-        for k in range(d):
-            s, p = np.int64(split[b, k]), np.int64(place[b, k])
-            less = fine[k] - s
-            at = p >> -less if less < 0 else p << less
-            first += ((index[b, k] << fine[k]) + at) * stride[k]
-            count *= np.int64(1) << max(less, 0)
+        first, count = whole(grid, split, place, index, b)
         total = 0.0
         for j in range(count):
-            rest, at = np.int64(j), first
-            for k in range(d - 1, -1, -1):
-                less = max(fine[k] - np.int64(split[b, k]), 0)
-                at += (rest & ((np.int64(1) << less) - 1)) * stride[k]
-                rest >>= less
-            total += bound[at]
+            total += bound[one(grid, split, b, first, j)]
         found[b] = total / count

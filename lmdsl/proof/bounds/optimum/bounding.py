@@ -12,7 +12,8 @@ import numpy as np
 from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.machine import threads
 from lmdsl.machine.kernels import kernel
-from lmdsl.proof.bounds.optimum.moves import Game, Moves, Parts
+from lmdsl.proof.bounds.optimum.moves import Game, Moves
+from lmdsl.proof.bounds.optimum.parts import Parts
 
 SLACK = 2.0**-40  # by how much bounds are lowered, relative: see settling.py
 MOST_MET = 2**16  # parts above which a range counts as all parts

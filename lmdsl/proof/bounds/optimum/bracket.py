@@ -11,7 +11,8 @@ from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline, Stopped
 from lmdsl.proof.bounds.optimum.bounding import SLACK, consistent, prepared, settle
-from lmdsl.proof.bounds.optimum.moves import DEEPEST, Game, Parts
+from lmdsl.proof.bounds.optimum.moves import DEEPEST, Game
+from lmdsl.proof.bounds.optimum.parts import Parts
 from lmdsl.proof.loop import Loop
 
 FEW = 2**22  # rows up to which cells are cut without a time limit

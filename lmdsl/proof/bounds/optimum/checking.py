@@ -14,7 +14,8 @@ from lmdsl.model.grid.boxes import named
 from lmdsl.proof.bounds.optimum.averages import Arrays
 from lmdsl.proof.bounds.optimum.bounding import prepared, violated
 from lmdsl.proof.bounds.optimum.bracket import Optimum
-from lmdsl.proof.bounds.optimum.moves import DEEPEST, Game, Parts
+from lmdsl.proof.bounds.optimum.moves import DEEPEST, Game
+from lmdsl.proof.bounds.optimum.parts import Parts
 from lmdsl.proof.loop import Loop
 
 

@@ -19,6 +19,7 @@ from lmdsl.model.successors.compiled import enclosing, places, tapes
 from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.noise import NoiseNormal
 from lmdsl.problem.problem import Problem
+from lmdsl.proof.bounds.optimum.parts import Parts
 from lmdsl.proof.images.pieces import pieces
 
 AT_A_TIME = 2**14  # most boxes enclosed at a time by a thread
@@ -45,31 +46,6 @@ class Moves(NamedTuple):
     cost: Floats
     enters: Bools
     seam: NDArray[np.int32]
-
-
-class Parts(NamedTuple):
-    """Equal parts of cells: bisections, parts, and stride by axis, shape (d,); and their number."""
-
-    split: Indices
-    shape: Indices
-    stride: Indices
-    size: int
-
-    @classmethod
-    def of(cls, partition: Partition, split: Indices) -> "Parts":
-        """Return the grid of parts."""
-        shape = partition.cells.astype(np.int64) << split
-        stride = np.append(np.cumprod(shape[:0:-1])[::-1], 1).astype(np.int64)
-        return cls(split, shape, stride, int(np.prod(shape.astype(object))))
-
-    def by_axis(self, part: Indices) -> Indices:
-        """Return the index of parts by axis, shape (len(part), d)."""
-        return np.asarray(part[:, None] // self.stride % self.shape)
-
-    def cell(self, partition: Partition, part: Indices) -> Indices:
-        """Return the cells of parts."""
-        stride = np.array([axis.stride for axis in partition.axes]).astype(np.int64)
-        return np.asarray(((self.by_axis(part) >> self.split) * stride).sum(axis=1))
 
 
 class Game:
