@@ -6,6 +6,7 @@ from pathlib import Path
 
 from lmdsl.cli.output import Arguments, Command, ProgressLine, answer, print_json, shared
 from lmdsl.cli.streams import say
+from lmdsl.cli.values import parameters, states
 from lmdsl.errors import printable
 from lmdsl.results.formats import FORMATS
 
@@ -23,6 +24,10 @@ def add(command: Command) -> None:
     simulate = command("simulate", _simulate, "Run the true map under a saved controller.")
     shared(simulate, "dir")
     simulate.add_argument("--starts", type=int, default=10_000, metavar="N")
+    simulate.add_argument("--from", dest="given", action="append", metavar="X,Y",
+                          help="a state to start from, instead; may be repeated")  # fmt: skip
+    simulate.add_argument("--parameter", action="append", default=[], metavar="NAME=VALUE",
+                          help="another value of a parameter; may be repeated")  # fmt: skip
     simulate.add_argument("--steps", type=int, default=10_000, metavar="T")
     simulate.add_argument("--seed", type=int, default=0, metavar="S")
     simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
@@ -69,8 +74,9 @@ def _simulate(parsed: Arguments) -> int:
     with ProgressLine() as progress:
         progress("simulate", -1.0)
         runs = result.simulate(
-            parsed.starts, parsed.steps, parsed.seed, parsed.hold, parsed.time_limit,
-            as_compiled=parsed.as_compiled,
+            parsed.starts if parsed.given is None else [states(text) for text in parsed.given],
+            parsed.steps, parsed.seed, parsed.hold, parsed.time_limit,
+            as_compiled=parsed.as_compiled, parameters=parameters(parsed.parameter),
         )  # fmt: skip
     if parsed.json:
         print_json(runs.to_dict())

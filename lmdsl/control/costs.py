@@ -5,6 +5,7 @@ from fractions import Fraction
 import numpy as np
 
 from lmdsl.common.types import Bools
+from lmdsl.control.after_arrival import quantiles
 from lmdsl.control.loop import CYCLING, LOST, REACHED, ClosedLoop, Runs
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
@@ -23,7 +24,10 @@ def counted(problem: Problem, runs: Runs) -> Bools:
 
 
 def mean_cost(loop: ClosedLoop, runs: Runs) -> MeanCost | None:
-    """Return the mean cost of runs, its standard error and what it lacks; None if not known."""
+    """Return the mean cost of runs, its standard error, what it lacks, and quantiles.
+
+    None if it is not known.
+    """
     on = counted(loop.problem, runs)
     cost = runs.cost[on]
     if not len(cost) or np.isnan(cost).any():
@@ -35,6 +39,7 @@ def mean_cost(loop: ClosedLoop, runs: Runs) -> MeanCost | None:
             "standard_error": error,
             "runs": len(cost),
             "cut_off": _cut_off(loop, runs, float((runs.outcome[on] == CYCLING).mean())),
+            **quantiles(cost),
         }
 
 

@@ -78,11 +78,12 @@ class Integrator:
             state[stopped] = self.partition.states(on_way, clip=False)
             cell[stopped] = watch.cell[stopped]
             end[:, stopped] = watch.where[:, stopped]
+        part = np.where(stopped, watch.when / self.flow.step, 1.0)
         integral = end[d] if len(end) > d else np.zeros(count)
         for piece in watch.drawn:
             open_ = np.isnan(piece).any(axis=1)
             piece[open_] = end[:d, open_].T
-        return Moved(state, cell, integral, watch.drawn)
+        return Moved(state, cell, integral, watch.drawn, part)
 
 
 class _Watch:
@@ -92,6 +93,7 @@ class _Watch:
         self.integrator, self.absorb = integrator, absorb
         self.outputs = integrator.flow.outputs
         self.cell = np.full(count, -2)  # of the event; -2 where there was none
+        self.when = np.zeros(count)  # time of the event since the start
         self.where = np.full((self.outputs, count if integrator.judged else 0), np.nan)
         self.drawn = np.full((pieces, count, integrator.partition.dimension), np.nan)
 
@@ -135,6 +137,7 @@ class _Watch:
         found = np.empty((self.outputs, int(met.sum())))
         places(start[:, met], bends[:, :, met], time[met], found)
         self.where[:, rows], self.cell[rows] = found, cell[met]
+        self.when[rows] = arc.time[near][met] + arc.length[near][met] * time[met]
         return time
 
     def _draw(self, arc: Arc, until: Floats) -> None:

@@ -1,6 +1,6 @@
 """The true map under a controller, step by step: runs to the attractor, and on inside it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from lmdsl.common import inputs
 from lmdsl.common.types import Floats, Indices, Statuses
+from lmdsl.control.after_arrival import Held, goes_on
 from lmdsl.control.controller import Controller
 from lmdsl.control.integration import Integrator
 from lmdsl.control.steps import CompiledSteps, Drawn, Moved, Steps
@@ -19,41 +20,18 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
-from lmdsl.problem.local_control import ConstantControl, HoldControl, absorbed_on_way
+from lmdsl.problem.changing import with_parameters
+from lmdsl.problem.local_control import HoldControl, absorbed_on_way
 from lmdsl.problem.problem import Problem
 from lmdsl.systems import DataSystem, MatrixSystem
 from lmdsl.systems.matrices.system import Draws
 from lmdsl.systems.named import NotStored
 
 REACHED, LOST, CYCLING = 0, 1, 2
+OUTCOMES = ("reached", "lost", "cycling")
 LOSSES = ("outside", "avoid", "no_control")  # where runs are lost: of the box, or such a cell
 
 FOREVER = Deadline()
-
-
-@dataclass(frozen=True)
-class Held:
-    """What became of the runs that reached A, under local controller and controller together.
-
-    Attributes
-    ----------
-    steps
-        Steps each run went on after its first entry into A; of a partial ``hold`` each that entered
-        a cell that holds.
-    stayed, returned, away, lost
-        Runs that never left A; that left it and are back at the end; that are underway at the
-        end; that were lost.
-    distance
-        Median and largest distance from the orbit at the end, in cell widths, of the runs in A;
-        None where there is no orbit, or no run.
-    """
-
-    steps: int
-    stayed: int
-    returned: int
-    away: int
-    lost: int
-    distance: tuple[float, float] | None
 
 
 class Runs(NamedTuple):
@@ -70,6 +48,8 @@ class Runs(NamedTuple):
     cost
         Sum over the steps of their costs, weighed by the powers of gamma (and of the discount),
         shape (r,).
+    time
+        How long they took, in steps: less than ``taken`` where the last one ended early.
     arrived
         States in which the runs that reached A entered it, in no particular order, shape (., d).
     power, dearest
@@ -80,6 +60,7 @@ class Runs(NamedTuple):
     taken: Indices
     loss: Indices
     cost: Floats
+    time: Floats
     arrived: Floats
     power: float
     dearest: float
@@ -91,12 +72,21 @@ class ClosedLoop:
     Of a finite model the next states are drawn by its rows, and are the centres of their cells.
     Differential equations are integrated accurately and judged all along their path, and noise is
     drawn from its distribution; :attr:`compiled` follows the compiled step and its noise nodes.
+
+    ``declared`` is the problem that was solved, whose cells these are; :meth:`under` makes runs of
+    one with other parameters.
     """
 
     def __init__(
-        self, problem: Problem, controller: Controller, status: Statuses, as_compiled: bool = False
+        self,
+        problem: Problem,
+        controller: Controller,
+        status: Statuses,
+        as_compiled: bool = False,
+        declared: Problem | None = None,
     ) -> None:
         self.problem, self.controller, self.status = problem, controller, status
+        self.declared = declared or problem
         self.as_compiled, self.partition = as_compiled, controller.partition
         self.true_map = TrueMap(problem, self.partition)
         system = problem.system
@@ -117,13 +107,18 @@ class ClosedLoop:
         """The same by the compiled step and its noise nodes."""
         if self.as_compiled:
             return self
-        return ClosedLoop(self.problem, self.controller, self.status, True)
+        return ClosedLoop(self.problem, self.controller, self.status, True, self.declared)
+
+    def under(self, parameters: Mapping[str, float]) -> "ClosedLoop":
+        """Return the same controller and cells with other parameters of the system."""
+        problem = with_parameters(self.declared, parameters)
+        return ClosedLoop(problem, self.controller, self.status, self.as_compiled, self.declared)
 
     @cached_property
     def steps(self) -> Steps:
         """What makes the steps."""
         if self.as_compiled or self.problem.flow() is None:
-            return CompiledSteps(self.true_map)
+            return CompiledSteps(self.true_map, self.declared)
         return Integrator(self.true_map, self.status)
 
     @property
@@ -190,23 +185,16 @@ class ClosedLoop:
         outcome = np.full(len(x), CYCLING, dtype=np.int64)
         taken = np.full(len(x), steps, dtype=np.int64)
         loss, cost = np.zeros(len(x), dtype=np.int64), np.zeros(len(x))
+        time = np.zeros(len(x))
         active, power, dearest = np.arange(len(x)), 1.0, 0.0
         for n in range(steps + 1):
-            state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
-            for code, ended in (
-                (REACHED, state == CellStatus.ATTRACTOR),
-                (LOST, state > CellStatus.STABILIZED),
-            ):
-                outcome[active[ended]] = code
-                taken[active[ended]] = n
-                if code == REACHED:
-                    arrived.append(x[ended])
-                    cost[active[ended]] += (power * self.paid(x[ended])) if n else 0.0
-                else:
-                    loss[active[ended]] = _losses(cell[ended], state[ended])
-            on = state == CellStatus.STABILIZED
-            active, x, cell = active[on], x[on], cell[on]
+            outcome[active], loss[active] = self.judged(cell)
             taken[active] = n
+            ended = outcome[active] == REACHED
+            arrived.append(x[ended])
+            cost[active[ended]] += (power * self.paid(x[ended])) if n else 0.0
+            on = outcome[active] == CYCLING
+            active, x, cell = active[on], x[on], cell[on]
             if n == steps or not len(active) or deadline():
                 break
             try:
@@ -216,9 +204,22 @@ class ClosedLoop:
             x, cell = moved.state, moved.cell
             with np.errstate(all="ignore"):
                 cost[active] += power * moved.cost
+                time[active] += moved.part
                 power *= self.weight
                 dearest = max(dearest, float(moved.cost.max()))
-        return Runs(outcome, taken, loss, cost, np.concatenate(arrived), power, dearest)
+        return Runs(outcome, taken, loss, cost, time, np.concatenate(arrived), power, dearest)
+
+    def judged(self, cell: Indices) -> tuple[Indices, Indices]:
+        """Return what became of runs by their cells, and of the lost an index of LOSSES."""
+        state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
+        ended = np.where(state == CellStatus.ATTRACTOR, REACHED, LOST)
+        loss = np.where(cell < 0, 0, np.where(state == CellStatus.AVOID, 1, 2))
+        return np.where(state == CellStatus.STABILIZED, CYCLING, ended), loss
+
+    @property
+    def step_time(self) -> float | None:
+        """The time of a step; None of a map, which has none."""
+        return getattr(self.problem.system, "step", None)
 
     def paid(self, x: Floats) -> Floats:
         """Return the terminal costs of states in A, shape (r,)."""
@@ -236,39 +237,7 @@ class ClosedLoop:
         """Run on from states of A, under the local controller inside A and the other outside."""
         if not self.holds:
             raise BadInput("the problem names no local controller", "local_controller")
-        local, (x, cell) = self.controller.local, self.partition.enter(x)
-        if local is None:  # of the cells of a partial hold, those that hold
-            on = self.controller.index[cell] >= 0
-            x, cell = x[on], cell[on]
-        runs = len(x)
-        stayed = np.ones(runs, dtype=np.bool_)
-        for n in range(steps):
-            try:
-                moved = self.move(x, cell, rng, deadline, absorb=False)
-            except TimeLimitReached:
-                steps = n
-                break
-            x, cell = moved.state, moved.cell
-            state = np.where(cell >= 0, self.status[cell], CellStatus.AVOID)
-            on = state <= CellStatus.STABILIZED
-            stayed = (stayed & (state == CellStatus.ATTRACTOR))[on]
-            x, cell = x[on], cell[on]
-            if not len(x):
-                break
-        inside = self.status[cell] == CellStatus.ATTRACTOR
-        distance = None
-        constant = isinstance(self.problem.local_controller, ConstantControl)
-        if inside.any() and local is not None and not constant:
-            away = local.distance(x[inside])
-            distance = (float(np.median(away)), float(away.max()))
-        return Held(
-            steps=steps,
-            stayed=int(stayed.sum()),
-            returned=int((inside & ~stayed).sum()),
-            away=int((~inside).sum()),
-            lost=runs - len(x),
-            distance=distance,
-        )
+        return goes_on(self, x, steps, rng, deadline)
 
     @own_arithmetic
     def path(self, x: ArrayLike, steps: int, seed: int = 0, *, as_compiled: bool = False) -> Floats:
@@ -285,11 +254,6 @@ class ClosedLoop:
             state, cell = self.step(state, cell, rng)
             states.append(state[0])
         return np.array(states)
-
-
-def _losses(cell: Indices, state: Statuses) -> Indices:
-    """Return why runs are lost that ended in such cells, as indices of LOSSES."""
-    return np.where(cell < 0, 0, np.where(state == CellStatus.AVOID, 1, 2))
 
 
 def draw_starts(

@@ -1,31 +1,72 @@
 """The true map in closed loop: runs, and what became of them."""
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Floats, Indices
-from lmdsl.control.costs import MeanCost, mean_cost
-from lmdsl.control.loop import CYCLING, LOSSES, LOST, REACHED, ClosedLoop, Held, draw_starts
+from lmdsl.control.after_arrival import Held, quantiles
+from lmdsl.control.costs import MeanCost, counted, mean_cost
+from lmdsl.control.loop import CYCLING, LOSSES, LOST, OUTCOMES, REACHED, ClosedLoop, Runs
 from lmdsl.control.steps import AS_DECLARED
-from lmdsl.errors import BadInput
-from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 
-UNSAID = ("aimed", "followed")  # fields that no report holds apart
+UNSAID = ("aimed", "followed", "given", "each")  # fields that no report holds apart
 FEW = 0.01  # share of runs that miss the attractor above which the samples are called too few
 
 
 @dataclass(frozen=True, eq=False)
-class Simulation(Frozen):
-    """Outcome of closed-loop runs of the true map from fresh random starts.
+class EachRun(Frozen):
+    """What became of each run, in the order of the starts.
 
     Attributes
     ----------
     starts
-        Number of runs; starts are drawn by m (a cell, then uniform inside).
+        Where they began, shape (r, d).
+    outcome
+        ``reached``, ``lost`` or ``cycling``, shape (r,).
+    lost_to
+        Of the lost ``outside``, ``avoid`` or ``no_control``, else empty, shape (r,).
+    steps, times
+        Steps made, shape (r,), and the time that they took: in steps, where there is no other.
+    cost
+        What was paid by the powers of gamma (and of the discount), shape (r,); NaN of runs that
+        have no cost: the lost, and those that go on where only arriving costs finitely.
+    """
+
+    starts: Floats
+    outcome: NDArray[np.str_]
+    lost_to: NDArray[np.str_]
+    steps: Indices
+    times: Floats
+    cost: Floats
+
+    @classmethod
+    def of(cls, loop: ClosedLoop, x: Floats, runs: Runs) -> Self:
+        """Return it of runs from states, shape (r, d)."""
+        lost = np.array((*LOSSES, ""))[np.where(runs.outcome == LOST, runs.loss, len(LOSSES))]
+        return cls(
+            x,
+            np.array(OUTCOMES)[runs.outcome],
+            lost,
+            runs.taken,
+            runs.time * (loop.step_time or 1.0),
+            np.where(counted(loop.problem, runs), runs.cost, np.nan),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Simulation(Frozen):
+    """Outcome of closed-loop runs of the true map.
+
+    Attributes
+    ----------
+    starts
+        Number of runs; starts are given, or drawn by m (a cell, then uniform inside).
     reached, lost, cycling
         Runs that entered A; that left the box, entered avoid or a cell without control; that did
         neither within the step limit.
@@ -44,14 +85,21 @@ class Simulation(Frozen):
     lost_to
         The lost by ``outside`` (left the box), ``avoid`` and ``no_control`` (entered such a cell).
     cost
-        ``mean`` of what ``runs`` paid, its ``standard_error`` (None for one run), and ``cut_off``,
-        at most how much more they pay later. The runs are the reached; with a discount, and gamma
-        times it below 1, all but the lost. None where there are none. To be compared with the
-        certificate's cost where none is left out.
+        ``mean`` of what ``runs`` paid, its ``standard_error`` (None for one run), ``cut_off``, at
+        most how much more they pay later, and quantiles as of ``steps``. The runs are the reached;
+        with a discount, and gamma times it below 1, all but the lost. None where there are none. To
+        be compared with the certificate's cost where none is left out.
     method
         What was followed, in words: the map, or how its equation was integrated.
     followed
         Whose runs they are: the true map's, or those of a finite model's rows.
+    times
+        The same quantiles as ``steps`` of the time until A is entered, in the units of the
+        equation; None of a map, and if none arrives.
+    given
+        The starts were given, not drawn.
+    each
+        What became of each run; not compared.
     """
 
     starts: int
@@ -68,6 +116,9 @@ class Simulation(Frozen):
     cost: MeanCost | None = None
     method: str = ""
     followed: str = "true map"
+    times: dict[str, float] | None = None
+    given: bool = False
+    each: EachRun | None = field(default=None, compare=False, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON."""
@@ -95,7 +146,8 @@ class Simulation(Frozen):
         """Return a summary for people."""
         low, high = self.interval
         lines = [
-            f"{self.starts} runs of the {self.followed} from random starts",
+            f"{self.starts} runs of the {self.followed} from "
+            f"{'given' if self.given else 'random'} starts",
             f"  reached the attractor  {self.reached}  ({100 * self.reached / self.starts:.4g} %; "
             f"95 % interval {100 * low:.4g} to {100 * high:.4g} %)",
             f"  lost                   {self.lost}{self._causes()}",
@@ -110,8 +162,13 @@ class Simulation(Frozen):
         if self.steps:
             steps = ", ".join(f"{k} {v}" for k, v in self.steps.items())
             lines.append(f"  steps                  {steps}")
+        if self.times:
+            lines.append(f"  time                   {_quantiles(self.times)}")
         if self.cost:
             lines.append(self._paid(self.cost))
+            if self.cost["runs"] != 1:
+                shown = {key: self.cost[key] for key in ("min", "q50", "q90", "q99", "max")}
+                lines.append(f"                         {_quantiles(shown)}")
         if self.held:
             held = self.held
             lines += [
@@ -121,6 +178,11 @@ class Simulation(Frozen):
                 f"    left, on the way back    {held.away}",
                 f"    left, and were lost      {held.lost}",
             ]
+            if held.inside is not None:
+                lines.append(f"    time in the attractor    {100 * held.inside:.4g} %")
+            if held.left and held.mean_to_leave is not None:
+                left = f"mean {held.mean_to_leave:.4g}, of these {_quantiles(held.left)}"
+                lines.append(f"    steps until it is left   {left}")
             if held.distance:
                 lines.append(
                     f"    distance from the orbit  median {held.distance[0]:.3g}, "
@@ -151,39 +213,37 @@ class Simulation(Frozen):
         return f"  ({', '.join(parts)})" * bool(parts)
 
 
+def _quantiles(values: Mapping[str, float | None]) -> str:
+    return ", ".join(f"{key} {value:.4g}" for key, value in values.items())
+
+
 def simulate(
     loop: ClosedLoop,
-    cells: Indices,
-    weight: Floats,
-    starts: int,
+    x: Floats,
     steps: int,
-    seed: int,
+    rng: np.random.Generator,
     hold: int,
     deadline: Deadline,
+    given: bool = False,
 ) -> Simulation:
-    """Simulate closed-loop runs from random starts.
+    """Simulate closed-loop runs.
 
     Parameters
     ----------
     loop
         The true map under the controller.
-    cells, weight
-        The cells of C and m on them; starts are drawn by m.
-    starts, steps, seed
-        Number of runs, step limit, seed of starts and noise.
+    x
+        The starts, shape (r, d).
+    steps, rng
+        Step limit, and what noise is drawn from.
     hold
         Steps to run on after the first entry into A, where there is a local controller.
     deadline
         When to stop: the runs that have not ended by then count as cycling.
+    given
+        Whether the starts were given, not drawn.
     """
-    # States, images and their cells, controls, noise, and the arrays of the formulas.
-    wide, live = len(loop.true_map.names), loop.true_map.map.live
-    memory.require(8 * starts * (16 * wide + 12 + live), "runs")
-    rng = np.random.default_rng(seed)
-    if not len(cells) or not weight.any():
-        raise BadInput("there is no stabilizable cell to start from")
-    x = draw_starts(loop.partition, cells, weight, starts, rng)
-    held = None
+    starts, held = len(x), None
     with loop.true_map.helped():
         runs = loop.run(x, steps, rng, deadline)
         if loop.holds:
@@ -192,16 +252,17 @@ def simulate(
     reached = int((outcome == REACHED).sum())
     made = int(taken.max())
     cycling = int((outcome == CYCLING).sum())
-    quantiles = None
+    in_steps, in_time = None, None
     if reached:
-        q = np.quantile(taken[outcome == REACHED], [0, 0.5, 0.9, 0.99, 1], method="inverted_cdf")
-        quantiles = dict(zip(("min", "q50", "q90", "q99", "max"), map(int, q), strict=True))
+        in_steps = {key: int(n) for key, n in quantiles(taken[outcome == REACHED]).items()}
+        if loop.step_time:
+            in_time = quantiles(runs.time[outcome == REACHED] * loop.step_time)
     return Simulation(
         starts=starts,
         reached=reached,
         lost=int((outcome == LOST).sum()),
         cycling=cycling,
-        steps=quantiles,
+        steps=in_steps,
         interval=clopper_pearson(reached, starts),
         held=held,
         steps_made=made,
@@ -213,6 +274,9 @@ def simulate(
         cost=mean_cost(loop, runs),
         method=loop.method,
         followed=loop.followed,
+        times=in_time,
+        given=given,
+        each=EachRun.of(loop, x, runs),
     )
 
 

@@ -46,12 +46,15 @@ class Moved(NamedTuple):
         What the step cost, without the terminal cost, shape (r,).
     drawn
         States within the step, not wrapped, shape (pieces, r, d); after an event, where that was.
+    part
+        Which part of the step was made, shape (r,), or 1 of all: an event ends it early.
     """
 
     state: Floats
     cell: Indices
     cost: Floats
     drawn: Floats
+    part: Floats | float = 1.0
 
 
 class Steps(Protocol):
@@ -70,11 +73,15 @@ class Steps(Protocol):
 
 
 class CompiledSteps:
-    """A map has no other steps; of a differential equation, what the compiled model is made of."""
+    """A map has no other steps; of a differential equation, what the compiled model is made of.
 
-    def __init__(self, true_map: TrueMap) -> None:
+    ``declared`` is the problem whose sets end a path, by default the map's own.
+    """
+
+    def __init__(self, true_map: TrueMap, declared: Problem | None = None) -> None:
         self.true_map = true_map
         self.problem, self.partition = true_map.problem, true_map.partition
+        self.declared = declared or self.problem
 
     @property
     def method(self) -> str:
@@ -90,7 +97,8 @@ class CompiledSteps:
         flow, problem = integrated(self.problem), self.problem
         if flow is None:
             return None
-        sets, endpoint = CellSets.of(problem, self.partition), problem.judged == "endpoint"
+        sets = CellSets.of(self.declared, self.partition)
+        endpoint = problem.judged == "endpoint"
         on, until = (PathJudge(flow, self.partition, sets, endpoint, a) for a in (False, True))
         return on, until
 
@@ -103,4 +111,5 @@ class CompiledSteps:
         ends = self._judges[absorb](values, (count,), guard, True)
         cell = np.where(ends.cell >= 0, ends.cell, -1).astype(np.int64)
         state = self.partition.states(np.ascontiguousarray(ends.place.T))
-        return Moved(state, cell, ends.integral if len(ends.integral) else cost, drawn)
+        part = ends.time / (self._judges[absorb].flow.substeps if len(ends.time) else 1)
+        return Moved(state, cell, ends.integral if len(ends.integral) else cost, drawn, part)

@@ -15,23 +15,18 @@ from lmdsl.certificate.claims import Certificate
 from lmdsl.common import inputs
 from lmdsl.common.records import freeze
 from lmdsl.common.types import Bools, Floats, Progress, Statuses
-from lmdsl.control.controller import Controller
-from lmdsl.control.loop import ClosedLoop
-from lmdsl.control.simulation import Simulation, simulate
+from lmdsl.control.questions import InUse
 from lmdsl.errors import BadInput, shown
-from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.grid.partition import Partition
-from lmdsl.model.local.controller import LocalController
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import CostFrom, Coverage, Summary
 from lmdsl.systems import MatrixSystem
-from lmdsl.systems.named import NotStored
 
 if TYPE_CHECKING:
     import os
@@ -41,7 +36,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
-class Result(Summary):
+class Result(Summary, InUse):
     """The answer to a problem; see :class:`Summary` for the scalars.
 
     Attributes
@@ -149,21 +144,6 @@ class Result(Summary):
             return None
         return min(1.0, (1 - b) * math.fsum(self.measure))
 
-    @cached_property
-    def controller(self) -> Controller:
-        """The feedback law, ``u = result.controller(x)``: the paper's C1, and C0 in A if any."""
-        attractor = self.cell_status == CellStatus.ATTRACTOR
-        try:
-            local = LocalController.of(self.problem, self.partition, attractor)
-        except NotStored:  # its linearisation needs the function; C1 does not
-            local = None
-        return Controller(self.partition, self.control_vectors, self.control_index, local)
-
-    @cached_property
-    def closed_loop(self) -> ClosedLoop:
-        """The true map under the controller."""
-        return ClosedLoop(self.problem, self.controller, self.cell_status)
-
     @property
     def stability_vector(self) -> Floats:
         """The vector w of claim 1, shape (N,): 0 where there is none."""
@@ -223,49 +203,6 @@ class Result(Summary):
             raise BadInput("no cell of C inside the boxes carries weight; enlarge them", "boxes")
         upper = sums.mean(weight, self.value, math.inf)
         return CostFrom(upper, sums.mean(weight, self.lower, -math.inf), math.fsum(weight))
-
-    @own_arithmetic
-    def simulate(
-        self,
-        starts: int = 10_000,
-        steps: int = 10_000,
-        seed: int = 0,
-        hold: int = 1_000,
-        time_limit: float | None = None,
-        *,
-        as_compiled: bool = False,
-    ) -> Simulation:
-        """Run the true map under the controller from fresh random starts drawn by m.
-
-        Differential equations are integrated accurately and judged all along their path (unless
-        the problem says ``endpoint``); noise is drawn from its distribution.
-
-        Parameters
-        ----------
-        starts, steps, seed
-            Number of runs, step limit of each, seed of starts and noise.
-        hold
-            With a local controller, steps to run on after the first entry into A.
-        time_limit
-            Seconds; runs that have not ended by then count as cycling.
-        as_compiled
-            Follow the compiled Runge-Kutta steps, and the noise nodes with their weights, instead.
-
-        Raises
-        ------
-        BadInput
-            There is no controller, or a count or the limit is not positive.
-        """
-        starts, steps = inputs.whole(starts, "starts"), inputs.whole(steps, "steps")
-        hold, seed = inputs.whole(hold, "hold"), inputs.seed(seed)
-        if (self.control_index < 0).all():
-            raise BadInput("there is no controller to simulate: " + self.message)
-        cells = np.flatnonzero(self.cell_status == CellStatus.STABILIZED)
-        weight = self.weight[cells]
-        deadline = Deadline.of(time_limit)
-        compiled = inputs.flag(as_compiled, "as_compiled")
-        loop = self.closed_loop.compiled if compiled else self.closed_loop
-        return simulate(loop, cells, weight, starts, steps, seed, hold, deadline)
 
     @own_arithmetic
     def prove(

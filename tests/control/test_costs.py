@@ -14,6 +14,7 @@ from problems import made, steps
 import lmdsl as lm
 
 STILL = {"kind": "map", "next": {"x": "x"}}
+QUANTILES = ("min", "q50", "q90", "q99", "max")
 
 
 def chain(seed, states=5, actions=2):
@@ -129,6 +130,7 @@ def test_where_the_attractor_has_to_be_reached_the_others_have_no_cost():
         assert 0 < found.reached < 900
         assert found.cost == {
             "mean": 1.0, "standard_error": 0.0, "runs": found.reached, "cut_off": 0.0,
+            **dict.fromkeys(QUANTILES, 1.0),
         }  # fmt: skip
         assert "cost of the reached" in found.text()
 
@@ -162,4 +164,5 @@ def test_what_is_said(tmp_path, capsys):
         "cost of all runs       2.73438 +- 0 (standard error), and 1.3 more at most after 4" in said
     )
     _, said, _ = run(capsys, *args, "--json")
-    assert set(json.loads(said)["cost"]) == {"mean", "standard_error", "runs", "cut_off"}
+    known = {"mean", "standard_error", "runs", "cut_off", *QUANTILES}
+    assert set(json.loads(said)["cost"]) == known
