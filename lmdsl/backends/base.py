@@ -99,6 +99,8 @@ class Options:
         A g-stabilizing policy, shape (n,), a column per cell.
     proof
         w > 0 with w > g P_u w for that policy, g = max(gamma, 1), shape (n,); None where unknown.
+    value
+        The cost of that policy, shape (n,); None where unknown.
     progress
         Called with (stage, fraction done or -1).
     """
@@ -109,6 +111,7 @@ class Options:
     algorithm: str | None = None
     start: Indices | None = None
     proof: Floats | None = None
+    value: Floats | None = None
     progress: Callable[[str, float], None] | None = None
 
 

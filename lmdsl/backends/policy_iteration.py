@@ -34,7 +34,7 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
         limit = options.time_limit
         return limit is not None and time.monotonic() - started > limit
 
-    policy, w = options.start, options.proof
+    policy, w, value = options.start, options.proof, options.value
     if policy is None:
         found = first_policy.stabilizing(lp, time_up)
         if isinstance(found, first_policy.Refused):
@@ -44,7 +44,8 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
             return Solution(stop, stop.name.lower())
         policy, w = found.policy, found.w
     try:
-        value = iteration.bound(lp, policy, w)
+        if value is None:
+            value = iteration.bound(lp, policy, w)
         if value is None:
             value = evaluation.evaluate(lp, policy, time_up=time_up)
     except Stopped:

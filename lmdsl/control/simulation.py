@@ -170,24 +170,7 @@ class Simulation(Frozen):
                 shown = {key: self.cost[key] for key in ("min", "q50", "q90", "q99", "max")}
                 lines.append(f"                         {_quantiles(shown)}")
         if self.held:
-            held = self.held
-            lines += [
-                f"  then {held.steps} more steps under local controller and controller together",
-                f"    stayed in the attractor  {held.stayed}",
-                f"    left, and came back      {held.returned}",
-                f"    left, on the way back    {held.away}",
-                f"    left, and were lost      {held.lost}",
-            ]
-            if held.inside is not None:
-                lines.append(f"    time in the attractor    {100 * held.inside:.4g} %")
-            if held.left and held.mean_to_leave is not None:
-                left = f"mean {held.mean_to_leave:.4g}, of these {_quantiles(held.left)}"
-                lines.append(f"    steps until it is left   {left}")
-            if held.distance:
-                lines.append(
-                    f"    distance from the orbit  median {held.distance[0]:.3g}, "
-                    f"max {held.distance[1]:.3g} cell widths"
-                )
+            lines += _went_on(self.held)
         return "\n".join(lines)
 
     __str__ = text
@@ -211,6 +194,28 @@ class Simulation(Frozen):
         words = {"outside": "left the box", "avoid": "in avoid", "no_control": "without control"}
         parts = [f"{count} {words[key]}" for key, count in self.lost_to.items() if count]
         return f"  ({', '.join(parts)})" * bool(parts)
+
+
+def _went_on(held: Held) -> list[str]:
+    """Return what became of the runs in A."""
+    lines = [
+        f"  then {held.steps} more steps under local controller and controller together",
+        f"    stayed in the attractor  {held.stayed}",
+        f"    left, and came back      {held.returned}",
+        f"    left, on the way back    {held.away}",
+        f"    left, and were lost      {held.lost}",
+    ]
+    if held.inside is not None:
+        lines.append(f"    time in the attractor    {100 * held.inside:.4g} %")
+    if held.left and held.mean_to_leave is not None:
+        left = f"mean {held.mean_to_leave:.4g}, of these {_quantiles(held.left)}"
+        lines.append(f"    steps until it is left   {left}")
+    if held.distance:
+        lines.append(
+            f"    distance from the orbit  median {held.distance[0]:.3g}, "
+            f"max {held.distance[1]:.3g} cell widths"
+        )
+    return lines
 
 
 def _quantiles(values: Mapping[str, float | None]) -> str:

@@ -57,6 +57,8 @@ class Graph(NamedTuple):
     alive: Bools
 
 
+Levels = tuple[NDArray[np.int32], Indices]  # level and first stabilizing column of every cell
+
 # Number of visits per entry above which predecessors are made: they cost about as much.
 PATIENCE = 8
 

@@ -34,9 +34,8 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.successors.left_out.dropping import left_out
 from lmdsl.model.successors.survival import Successors
+from lmdsl.problem.changing import with_gamma_alone
 from lmdsl.problem.problem import Problem
-
-Levels = tuple[NDArray[np.int32], Indices]  # level and first stabilizing column of every cell
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +54,10 @@ class StabilizationLP(Frozen):
         The cells of C by their index in the state box, ascending, shape (n,).
     pair_pointer
         Shape (n + 1,): the columns of the i-th cell of C are ``pair_pointer[i]:pair_pointer[i+1]``.
-    control
-        Control index of every column, shape (K,), int32.
+    control, cost
+        Control index of every column, int32, and its stage cost G, shape (K,) each.
     rows
         Compact transition rows P, one per column; target n is the attractor.
-    cost
-        Stage cost G of every column, shape (K,).
     gamma
         Geometric weight of the cost.
     weight
@@ -88,10 +85,10 @@ class StabilizationLP(Frozen):
     sure_levels: NDArray[np.int32] | None = None
     hold: holding.Controls | None = None
     dropped: NDArray[np.int64] | None = None
-    _known: InitVar[Levels | None] = None
-    _levels: ClassVar[Levels | None] = None
+    _known: InitVar[algorithm_1.Levels | None] = None
+    _levels: ClassVar[algorithm_1.Levels | None] = None
 
-    def __post_init__(self, _known: Levels | None) -> None:
+    def __post_init__(self, _known: algorithm_1.Levels | None) -> None:
         super().__post_init__()
         object.__setattr__(self, "_levels", _known)  # of these pairs: no copy takes it over
 
@@ -137,10 +134,7 @@ class StabilizationLP(Frozen):
 
     @property
     def solve_weight(self) -> Floats:
-        """The weight backends solve with: uniform on C, shape (n,), sum 1.
-
-        V does not depend on a positive weight; zeros in m would leave it undetermined there.
-        """
+        """What backends solve with: 1/n on C. V depends on no weight that is positive."""
         return np.full(self.n, 1.0 / max(self.n, 1))
 
     @property
@@ -194,6 +188,11 @@ class StabilizationLP(Frozen):
             cost=self.cost[policy],
         )
 
+    def with_gamma(self, gamma: float) -> "StabilizationLP":
+        """Return the same model with another gamma; BadInput where more depends on it."""
+        problem = with_gamma_alone(self.problem, gamma)
+        return replace(self, problem=problem, gamma=problem.gamma, _known=self._algorithm_1)
+
     @property
     def tree(self) -> tuple[NDArray[np.int32], Indices]:
         """Algorithm 1 on the surviving pairs: level and first stabilizing column of every cell."""
@@ -201,7 +200,7 @@ class StabilizationLP(Frozen):
         return fixed(level), fixed(policy)
 
     @cached_property
-    def _algorithm_1(self) -> Levels:
+    def _algorithm_1(self) -> algorithm_1.Levels:
         """The same as our own code reads it: compiled loops tell read-only arrays from others."""
         return self._levels or algorithm_1.tree(self.pair_pointer, self.rows)
 
@@ -276,8 +275,7 @@ def compile(  # noqa: A001
     TimeLimitReached
         The time limit was reached.
     BadInput
-        The declared sets have no cells, the stage cost is negative or not finite, or the problem
-        does not fit in memory.
+        A set has no cells, a cost is negative or not finite, or memory does not suffice.
     """
     deadline = Deadline.of(time_limit)
     inputs.kind(problem, Problem, "problem", "a Problem")

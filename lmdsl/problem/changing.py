@@ -1,4 +1,4 @@
-"""Changed copies of a problem: other parameters of its system."""
+"""Changed copies of a problem: other parameters of its system, another gamma."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 from lmdsl.common import inputs, spelling
 from lmdsl.errors import BadInput, shown
 from lmdsl.problem.problem import Problem
+from lmdsl.systems import MatrixSystem
 
 
 def with_parameters(problem: Problem, parameters: Any) -> Problem:
@@ -25,3 +26,23 @@ def with_parameters(problem: Problem, parameters: Any) -> Problem:
             raise BadInput(f"{shown(value)} is not a finite number", where)
     changed = {**system.parameters, **{name: float(x) for name, x in parameters.items()}}
     return problem.replaced(system=system.replaced(parameters=changed))
+
+
+def gamma_alone(problem: Problem, changed: Problem) -> str:
+    """Return what of the compiled model changes with gamma beside it; empty where nothing does."""
+    if problem.terminal_cost is not None:
+        return "the terminal cost is paid times gamma"
+    if isinstance(problem.system, MatrixSystem) and problem.system.best_reward is not None:
+        return "what a reward misses depends on gamma"
+    if problem.ends_in_time != changed.ends_in_time:
+        return "gamma times the discount goes through 1, and with it what can be stabilized"
+    return ""
+
+
+def with_gamma_alone(problem: Problem, gamma: float) -> Problem:
+    """Return a problem with another gamma and the same finite model; BadInput where it differs."""
+    changed = problem.replaced(gamma=gamma)
+    why = gamma_alone(problem, changed)
+    if why:
+        raise BadInput(f"{why}: compile the problem again, problem.replaced(gamma=...)", "gamma")
+    return changed

@@ -21,7 +21,7 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.stabilizable_set import LOST, CellStatus
-from lmdsl.optimize.feasibility import first_policy, gamma_bar, restriction
+from lmdsl.optimize.feasibility import first_policy, gamma_bar, lifting, restriction
 from lmdsl.optimize.witness import certify
 from lmdsl.problem.problem import Problem
 from lmdsl.results.job import _Job, not_compiled
@@ -43,6 +43,7 @@ def solve(
     require_all: bool = False,
     restrict_to_gamma: bool = False,
     proved: float | None = None,
+    start: Result | None = None,
     progress: Progress | None = None,
 ) -> Result:
     """Solve a problem and verify the answer.
@@ -70,6 +71,9 @@ def solve(
         Share of the volume of C that is to be proved to arrive, on the true map: pairs that lose
         runs, or of which that is undecided, are dropped and the rest is solved again, until it is
         reached or nothing helps (see ``Result.proved``).
+    start
+        An earlier result of the same states and controls, on other cells, with other samples or
+        another gamma, say: the search begins at its controller. The answer is the same.
     progress
         Called with (stage, fraction done, or -1).
 
@@ -99,6 +103,7 @@ def solve(
         max_iterations=max_iterations,
         require_all=require_all,
         restrict_to_gamma=restrict_to_gamma,
+        start=_earlier(start),
         progress=progress,
     )
     if proved is None:
@@ -140,7 +145,15 @@ class _Request:
     max_iterations: int | None
     require_all: bool
     restrict_to_gamma: bool
+    start: lifting.Earlier | None
     progress: Progress | None
+
+    def first(
+        self, lp: StabilizationLP
+    ) -> first_policy.Feasible | first_policy.Refused | first_policy.Undecided:
+        """Return the policy to begin with: of an earlier controller, where that serves."""
+        found = None if self.start is None else lifting.lifted(lp, self.start, self.deadline)
+        return found or first_policy.stabilizing(lp, self.deadline)
 
     def tell(self, stage: str) -> None:
         """Tell the caller what begins."""
@@ -153,11 +166,13 @@ def _answer(lp: StabilizationLP, request: _Request, compile_seconds: float | Non
     deadline = request.deadline
     job = _Job(lp, request.name, request.tolerance, compile_seconds)
     job.finish = deadline.again()
+    if request.start is not None:
+        request.start.require_fit(lp)
     refused = _not_stabilizable(lp, request.require_all, job.finish)
     if refused:
         return job.refused(*refused)
     started = time.perf_counter()
-    first = first_policy.stabilizing(lp, deadline)
+    first = request.first(lp)
     if isinstance(first, first_policy.Refused):
         infeasible = _infeasible(lp, first, request, job, started)
         if infeasible is not None:
@@ -212,6 +227,7 @@ def _asked(
             algorithm=request.algorithm,
             start=first.policy,
             proof=first.w,
+            value=first.value,
             progress=request.progress,
         )
         request.tell("solve")
@@ -227,6 +243,17 @@ def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:
         raise BadInput(f"{shown(tolerance)} must be a finite number >= 0", "tolerance")
     if max_iterations is not None:
         inputs.whole(max_iterations, "max_iterations", most=math.inf)
+
+
+def _earlier(start: Any) -> lifting.Earlier | None:
+    """Return the controller to begin with, None where none is asked for."""
+    if start is None:
+        return None
+    inputs.kind(start, Result, "start", "a Result")
+    if (start.control_index < 0).all():
+        raise BadInput("it has no controller; leave it out, or give another result", "start")
+    own = start.problem.controls
+    return lifting.Earlier(start.partition, own, start.control_vectors, start.control_index)
 
 
 def _no_enclosures(problem: Problem) -> None:

@@ -27,10 +27,11 @@ NEAR = 64  # largest level above which a few passes from the levels hardly make 
 
 @dataclass(frozen=True, eq=False)
 class Feasible:
-    """A g-stabilizing policy, and a proof of it: w > 0 with w > g P_u w."""
+    """A g-stabilizing policy, and a proof of it: w > 0 with w > g P_u w; its value if known."""
 
     policy: Policy
     w: Floats
+    value: Floats | None = None
 
 
 @dataclass(frozen=True, eq=False)
