@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from lmdsl.advice.checking import check as check
     from lmdsl.advice.report import CheckReport as CheckReport
     from lmdsl.advice.report import Finding as Finding
+    from lmdsl.advice.studies.record import Study as Study
+    from lmdsl.advice.studies.running import study as study
     from lmdsl.certificate.claims import Certificate as Certificate
     from lmdsl.control.controller import Controller as Controller
     from lmdsl.control.simulation import Simulation as Simulation
@@ -67,6 +69,7 @@ _HOME = {
     "Result": "results.result",
     "Simulation": "control.simulation",
     "StabilizationLP": "model.lp",
+    "Study": "advice.studies.record",
     "TimeLimitReached": "machine.deadline",
     "Verification": "results.verification",
     "check": "advice.checking",
@@ -79,6 +82,7 @@ _HOME = {
     "load": "problem.problem",
     "read_data": "data.tables",
     "solve": "results.solving",
+    "study": "advice.studies.running",
     "verify": "results.verification",
 }
 _PACKAGES = {name: name for name in ("backends", "plotting", "systems", "testing")}

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from lmdsl.cli import feasibility, listing, results, solving
+from lmdsl.cli import feasibility, listing, results, solving, studies
 from lmdsl.cli.output import Arguments, Run, narrated, print_json
 from lmdsl.cli.streams import kept
 from lmdsl.errors import LmdslError, printable, shown
@@ -87,6 +87,6 @@ def _parser() -> argparse.ArgumentParser:
         sub.set_defaults(run=run)
         return sub
 
-    for group in (solving, results, feasibility, listing):
+    for group in (solving, results, feasibility, studies, listing):
         group.add(command)
     return parser

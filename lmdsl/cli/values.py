@@ -27,3 +27,26 @@ def parameters(given: Sequence[str]) -> dict[str, float] | None:
             raise BadInput(f"{shown(text)} is not NAME=VALUE, such as mu=1.1", "--parameter")
         found[name.strip()] = number(value, "--parameter")
     return found or None
+
+
+def numbers(text: str, where: str, whole: bool = False) -> list[float] | list[int]:
+    """Return numbers that were written with commas between them."""
+    if not whole:
+        return [number(part, where) for part in text.split(",")]
+    return [_count(part, where) for part in text.split(",")]
+
+
+def counts(text: str, where: str) -> list[int | list[int]]:
+    """Return counts, each one number or one of each axis: ``32,12x24``."""
+    found: list[int | list[int]] = []
+    for part in text.split(","):
+        each = [_count(n, where) for n in part.lower().split("x")]
+        found.append(each if len(each) > 1 else each[0])
+    return found
+
+
+def _count(text: str, where: str) -> int:
+    try:
+        return int(text)
+    except ValueError:
+        raise BadInput(f"{shown(text)} is not a whole number", where) from None

@@ -5,8 +5,9 @@ from lmdsl.plotting.closed_loop import trajectories
 from lmdsl.plotting.page import figure
 from lmdsl.plotting.plots import causes, control, cost, measure, portrait
 from lmdsl.plotting.proofs import proof
+from lmdsl.plotting.studies import study
 
 __all__ = [
     "bracket", "causes", "control", "cost", "figure", "measure", "portrait", "proof",
-    "trajectories",
+    "study", "trajectories",
 ]  # fmt: skip

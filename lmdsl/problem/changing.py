@@ -1,5 +1,6 @@
-"""Changed copies of a problem: other parameters of its system, another gamma."""
+"""Changed copies of a problem: other parameters of its system, another gamma, step, samples."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -7,6 +8,8 @@ from lmdsl.common import inputs, spelling
 from lmdsl.errors import BadInput, shown
 from lmdsl.problem.problem import Problem
 from lmdsl.systems import MatrixSystem
+
+MOST_SUBSTEPS = 1_000  # number above which no problem may have more
 
 
 def with_parameters(problem: Problem, parameters: Any) -> Problem:
@@ -46,3 +49,21 @@ def with_gamma_alone(problem: Problem, gamma: float) -> Problem:
     if why:
         raise BadInput(f"{why}: compile the problem again, problem.replaced(gamma=...)", "gamma")
     return changed
+
+
+def with_samples(problem: Problem, count: int) -> Problem:
+    """Return a problem with other samples: so many an axis of a grid, else so many a cell."""
+    key = "per_axis" if problem.sampling.kind == "grid" else "points"
+    return problem.replaced(sampling=problem.sampling.replaced(**{key: count}))
+
+
+def with_step(problem: Problem, step: float) -> Problem:
+    """Return a problem with another sampling time, integrated as finely; BadInput of a map."""
+    system: Any = problem.system
+    if not hasattr(system, "step"):
+        raise BadInput("a map has no step; leave it out", "step")
+    changes: dict[str, Any] = {"step": step}
+    if isinstance(system.substeps, int):
+        as_fine = math.ceil(min(system.substeps * step / system.step, 1e6) - 1e-9)
+        changes["substeps"] = min(max(as_fine, 1), MOST_SUBSTEPS)
+    return problem.replaced(system=system.replaced(**changes))

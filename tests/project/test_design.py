@@ -30,9 +30,9 @@ FORWARDING = {("model.lp", "results.exports.mps")}
 PUBLIC = [
     "Area", "BadInput", "CellStatus", "Certificate", "CheckReport", "Comparison", "Controller",
     "Explanation", "Finding", "GammaBar", "LmdslError", "PhaseOne", "Problem", "Region", "Result",
-    "Simulation", "StabilizationLP", "TimeLimitReached", "Verification", "__version__", "backends",
-    "check", "compare", "compile", "explain", "exports", "from_data",
-    "from_matrices", "gamma_max", "load", "plotting", "read_data", "solve", "systems",
+    "Simulation", "StabilizationLP", "Study", "TimeLimitReached", "Verification", "__version__",
+    "backends", "check", "compare", "compile", "explain", "exports", "from_data",
+    "from_matrices", "gamma_max", "load", "plotting", "read_data", "solve", "study", "systems",
     "testing", "verify",
 ]  # fmt: skip
 

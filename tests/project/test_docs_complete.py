@@ -164,14 +164,14 @@ def test_every_public_name_is_described():
 
 
 @pytest.mark.parametrize(
-    "name", ["solve", "compare", "compile", "explain", "gamma_max", "load", "verify"]
+    "name", ["solve", "compare", "compile", "explain", "gamma_max", "load", "study", "verify"]
 )
 def test_signatures_are_as_described(name):
     check_signature(f"lm.{name}", getattr(lm, name))
 
 
 @pytest.mark.parametrize(
-    "name", ["portrait", "cost", "causes", "control", "measure", "trajectories", "figure"]
+    "name", ["portrait", "cost", "causes", "control", "measure", "trajectories", "figure", "study"]
 )
 def test_signatures_of_plots_are_as_described(name):
     check_signature(name, getattr(plotting, name))

@@ -1,0 +1,1 @@
+"""A problem in many variants: cells, samples, step, gamma and backends in turn."""
