@@ -16,7 +16,7 @@ KNOBS = ("step", "samples", "cells", "gamma", "backend")  # the last changes fas
 MOST = 10_000  # number of variants above which a study is refused
 
 
-class Asked(NamedTuple):
+class Variation(NamedTuple):
     """One variant that is asked for.
 
     Attributes
@@ -57,11 +57,11 @@ class Asked(NamedTuple):
         return problem
 
 
-def own_values(problem: Problem) -> Asked:
+def own_values(problem: Problem) -> Variation:
     """Return the values that a problem has itself."""
     sampling: Any = problem.sampling
     samples = sampling.per_axis if sampling.kind == "grid" else sampling.points
-    return Asked(
+    return Variation(
         {name: axis.cells for name, axis in problem.state_box.items()},
         samples if isinstance(samples, int) else None,
         getattr(problem.system, "step", None),
@@ -70,7 +70,7 @@ def own_values(problem: Problem) -> Asked:
     )
 
 
-def variants(problem: Problem, given: Mapping[str, Any]) -> list[Asked]:
+def variants(problem: Problem, given: Mapping[str, Any]) -> list[Variation]:
     """Return all variants, those that share a compiled model one after the other.
 
     ``given`` holds a list for every knob that is turned, under its name or in the plural; None
@@ -94,7 +94,7 @@ def variants(problem: Problem, given: Mapping[str, Any]) -> list[Asked]:
                 raise BadInput("a finite model has its states; leave it out", key)
     if given.get("step") is not None and own.step is None:
         raise BadInput("a map has no step; leave it out", "step")
-    found = [Asked(**dict(zip(KNOBS, each, strict=True)))
+    found = [Variation(**dict(zip(KNOBS, each, strict=True)))
              for each in itertools.product(*(values[name] for name in KNOBS))]  # fmt: skip
     if len(found) > MOST:
         raise BadInput(f"these are {len(found):,} variants; {MOST:,} at most", "study")

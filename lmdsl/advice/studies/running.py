@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from lmdsl.advice.studies.keeping import Folder
-from lmdsl.advice.studies.knobs import Asked, variants
+from lmdsl.advice.studies.knobs import Variation, variants
 from lmdsl.advice.studies.orders import orders
 from lmdsl.advice.studies.record import Study, StudyRow
 from lmdsl.common import inputs
@@ -107,7 +107,7 @@ class _Work:
         self.compiled: Problem | None = None  # what the model was compiled from
         self.last: Result | str | None = None  # the last controller, or the key of one that is kept
 
-    def row(self, asked: Asked) -> StudyRow:
+    def row(self, asked: Variation) -> StudyRow:
         """Return what becomes of a variant, or became of it before."""
         key = ""
         try:
@@ -125,7 +125,7 @@ class _Work:
             self.folder.add(key, row, result)
         return row
 
-    def _solved(self, problem: Problem, asked: Asked) -> Result:
+    def _solved(self, problem: Problem, asked: Variation) -> Result:
         deadline = Deadline.of(self.options["time_limit"])
         given: Problem | StabilizationLP = problem
         fresh = not self._at_hand(problem)
@@ -158,7 +158,7 @@ class _Work:
                 self.last = None
         return self.last
 
-    def _ran(self, result: Result, asked: Asked) -> StudyRow:
+    def _ran(self, result: Result, asked: Variation) -> StudyRow:
         """Return the row of a result, with runs of the true map where there is a controller."""
         starts, runs = self.options["starts"], None
         if starts and (result.control_index >= 0).any() and result.stabilizable_cells:
