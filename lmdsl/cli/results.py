@@ -48,12 +48,25 @@ def add(command: Command) -> None:
     shared(plot, "dir")
     plot.add_argument("--out", metavar="FILE", help="PNG, PDF or SVG (default DIR/figures.png)")
 
+    _add_report(command)
     export = command("export", _export, "Write a saved result in a format for other readers.")
     shared(export, "dir")
     uses = "; ".join(f"{name}: {use}" for name, use in FORMATS.items())
     export.add_argument("--format", required=True, choices=FORMATS, help=uses)
     export.add_argument("--out", required=True, metavar="FILE", help="file to write")
     shared(export, "--time-limit")
+
+
+def _add_report(command: Command) -> None:
+    report = command("report", _report, "Write one page about a saved result: HTML, no network.")
+    shared(report, "dir")
+    report.add_argument("--out", metavar="FILE", help="file ending in .html (DIR/report.html)")
+    report.add_argument("--verify", dest="check", action="store_true",
+                        help="check every claim again, and say on the page what holds")  # fmt: skip
+    report.add_argument("--backends", default="", metavar="A,B",
+                        help="compare these backends on the page")  # fmt: skip
+    report.add_argument("--seed", type=int, default=0, metavar="S", help="of the runs shown")
+    shared(report, "--time-limit")
 
 
 def _verify(parsed: Arguments) -> int:
@@ -111,6 +124,22 @@ def _plot(parsed: Arguments) -> int:
     plotting.figure(result, path, proof=proof)
     say(f"written to {printable(str(path))} ({AS_STORED})")
     return 0
+
+
+def _report(parsed: Arguments) -> int:
+    from lmdsl.report.writing import write_directory
+
+    names = tuple(name.strip() for name in parsed.backends.split(",") if name.strip())
+    with ProgressLine() as progress:
+        path, found = write_directory(
+            parsed.dir, parsed.out, check=parsed.check, backends=names, seed=parsed.seed,
+            time_limit=parsed.time_limit, progress=progress,
+        )  # fmt: skip
+    checked = AS_STORED if found is None else "every claim holds"
+    if found is not None and not found.holds:
+        checked = "NOT confirmed: " + "; ".join(map(printable, found.reasons))
+    say(f"written to {printable(str(path))} ({checked})")
+    return int(found is not None and not found.holds)
 
 
 def _export(parsed: Arguments) -> int:

@@ -1,13 +1,14 @@
 """The scalar part of a result."""
 
+import os
 from dataclasses import dataclass, field, fields
-from typing import Any, Self
+from typing import Any, Self, cast
 
 import numpy as np
 
 from lmdsl.certificate.claims import Safe
 from lmdsl.common.records import Frozen, Reported, jsonable
-from lmdsl.common.types import Statuses
+from lmdsl.common.types import Progress, Statuses
 from lmdsl.control.accuracy import IntegrationError
 from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.simulation import Simulation
@@ -223,3 +224,39 @@ class Summary(Frozen):
         found = Status(self.status).exit_status
         missed = self.proved is not None and not self.proved.reached
         return 1 if missed and not found else found
+
+
+class Paged:
+    """What becomes a page; the package that writes it is imported when it is asked for."""
+
+    def report(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        proof: Any = None,
+        comparison: Any = None,
+        seed: int = 0,
+        progress: Progress | None = None,
+    ) -> None:
+        """Write one self-contained page about the result, HTML without network.
+
+        Parameters
+        ----------
+        path
+            The file, ending in .html; it appears whole or not at all.
+        proof, comparison
+            What :meth:`Result.prove` and :func:`lmdsl.compare` returned, to be told of, too.
+        seed
+            Of the runs that are simulated where the result has none.
+        progress
+            Called with (stage, fraction done, or -1).
+
+        Raises
+        ------
+        BadInput
+            The ending is another, the file cannot be written, or plotly is not installed.
+        """
+        from lmdsl.report.writing import write
+
+        write(cast(Any, self), path, proof=proof, comparison=comparison, seed=seed,
+              progress=progress)  # fmt: skip

@@ -21,11 +21,11 @@ PACKAGE = Path(lm.__file__).parent
 PACKAGES = [
     "errors", "machine", "common", "formulas", "systems", "problem", "model", "certificate",
     "optimize", "backends", "data", "proof", "control", "results", "explanation", "advice",
-    "plotting", "testing", "cli", "__main__",
+    "plotting", "report", "testing", "cli", "__main__",
 ]  # fmt: skip
 
 # Imports against the order, inside functions: methods that only forward to a later package.
-FORWARDING = {("model.lp", "results.exports.mps")}
+FORWARDING = {("model.lp", "results.exports.mps"), ("results.summary", "report.writing")}
 
 PUBLIC = [
     "Area", "BadInput", "CellStatus", "Certificate", "CheckReport", "Comparison", "Controller",

@@ -1,0 +1,134 @@
+"""Writing the page of a result: one file, whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from importlib.util import find_spec
+from pathlib import Path
+
+from lmdsl.common import inputs
+from lmdsl.common.files import write_whole
+from lmdsl.common.types import Progress
+from lmdsl.errors import BadInput, LmdslError, MissingDependency, plain_text, shown
+from lmdsl.machine import memory
+from lmdsl.machine.surroundings import own_arithmetic
+from lmdsl.proof.record import Proof
+from lmdsl.report.gathering import Beside, gathered
+from lmdsl.report.page import page
+from lmdsl.results.comparison import Comparison
+from lmdsl.results.directory import archive, proved, writing
+from lmdsl.results.result import Result
+from lmdsl.results.verification import Verification, recompiled, verify
+
+ENDINGS = (".html", ".htm")
+EACH = 400.0  # bytes a cell, at most
+
+
+@own_arithmetic
+def write(
+    result: Result,
+    path: str | os.PathLike[str],
+    *,
+    proof: Proof | None = None,
+    comparison: Comparison | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> None:
+    """Write one page about a result; see :meth:`Result.report`."""
+    inputs.kind(result, Result, "result", "a Result")
+    if proof is not None:
+        inputs.kind(proof, Proof, "proof", "what Result.prove returns")
+        if len(proof.cell) and int(proof.cell.max()) >= result.partition.size:
+            raise BadInput("it is a proof of another result", "proof")
+    if comparison is not None:
+        inputs.kind(comparison, Comparison, "comparison", "what lmdsl.compare returns")
+    missing = "" if result.lp is not None else "spectrum: the result was read from a directory, " \
+        "which holds no model; `lmdsl report DIR` compiles it again"  # fmt: skip
+    asked = Beside(result.lp, proof or result.proof, comparison, missing=missing)
+    _write(result, path, asked, inputs.seed(seed), progress)
+
+
+@own_arithmetic
+def write_directory(
+    directory: str | os.PathLike[str],
+    path: str | os.PathLike[str] | None = None,
+    *,
+    check: bool = False,
+    backends: tuple[str, ...] = (),
+    seed: int = 0,
+    time_limit: float | None = None,
+    progress: Progress | None = None,
+) -> tuple[Path, Verification | None]:
+    """Write one page about a result directory; return where, and what checking it found.
+
+    Parameters
+    ----------
+    directory
+        The result directory.
+    path
+        The file; default ``report.html`` in the directory.
+    check
+        Whether every claim is checked anew, as by :func:`lmdsl.verify`.
+    backends
+        Backends to compare, as for :func:`lmdsl.compare`.
+    seed
+        Of the runs.
+    time_limit
+        Seconds for compiling the model, for checking, and for each backend.
+    progress
+        Called with (stage, fraction done, or -1).
+    """
+    from lmdsl.results.comparison import compare
+
+    target = Path(directory) / "report.html" if path is None else inputs.path(path)
+    _refuse_ending(target)
+    _library()  # before the work
+    stored = archive.read(directory)
+    result = stored.result
+    proof = proved.as_stored(directory, result, stored.certificate.proof)
+    lp, missing = None, ""
+    try:
+        lp = recompiled(directory, result, progress, time_limit)
+    except LmdslError as error:
+        missing = f"spectrum and decay: the model was not compiled: {plain_text(error)}"
+    found = verify(directory, progress=progress, time_limit=time_limit) if check else None
+    comparison = None
+    if backends:
+        comparison = compare(
+            result.problem if lp is None else lp, backends, time_limit=time_limit,
+            progress=progress,
+        )  # fmt: skip
+    asked = Beside(lp, proof, comparison, found, str(directory), missing)
+    _write(result, target, asked, inputs.seed(seed), progress)
+    return target, found
+
+
+def _write(
+    result: Result,
+    path: str | os.PathLike[str],
+    asked: Beside,
+    seed: int,
+    progress: Progress | None,
+) -> None:
+    target = inputs.path(path)
+    _refuse_ending(target)
+    writing.refuse_own_file(target)
+    library = _library()
+    memory.require(EACH * result.partition.size + 1e8, "the report")
+    content = page(gathered(result, asked, seed, progress), library)
+    write_whole(target, content.encode("utf-8", "replace"))
+
+
+def _refuse_ending(target: Path) -> None:
+    if target.suffix.lower() not in ENDINGS:
+        raise BadInput(f"{shown(str(target), 200)}: a report ends in .html")
+
+
+def _library() -> str:
+    """Return the source of plotly.js, as the package plotly holds it."""
+    found = find_spec("plotly")
+    for place in (found.submodule_search_locations or ()) if found else ():
+        file = Path(place) / "package_data" / "plotly.min.js"
+        if file.is_file():
+            return file.read_text(encoding="utf-8")
+    raise MissingDependency('reports need plotly: pip install "lmdsl[report]"')

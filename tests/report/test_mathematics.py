@@ -1,0 +1,130 @@
+"""Formulas as MathML: what is drawn means what was written, read by an independent reader."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from formula_texts import Oracle
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lmdsl.formulas.operations import FORMULA_FUNCTIONS
+from lmdsl.report import mathematics as m
+
+NAMES = {"x": 0.7, "theta": -1.3, "x_1": 2.1, "k12": 0.4, "a_b_c": 1.7, "Omega": -0.2}
+SPOKEN = {letter: name for name, letter in m.GREEK.items()}
+SIGNS = {"−": "-", "·": "*", "\u2062": "*", "≤": "<=", "≥": ">=", "=": "==", "≠": "!="}
+FENCES = {"⌊": "floor", "⌈": "ceil", "|": "abs"}
+
+
+def said(element):
+    """The Python text of an element: what a reader of mathematics takes it to be."""
+    tag, parts = element.tag, list(element)
+    words = element.text or ""
+    if tag == "mi":
+        return SPOKEN.get(words, {"π": "pi"}.get(words, words))
+    if tag == "mn":
+        return words.replace("−", "-")
+    if tag == "mo":
+        return SIGNS.get(words, words)
+    if tag == "mtext":
+        return words.replace("\xa0", " ")
+    if tag == "mspace":
+        return ""
+    if tag == "mfrac":
+        return f"(({said(parts[0])})/({said(parts[1])}))"
+    if tag == "msqrt":
+        return f"sqrt({''.join(map(said, parts))})"
+    if tag == "msup":
+        return f"(({said(parts[0])})**({said(parts[1])}))"
+    if tag == "msub":
+        base, index = map(said, parts)
+        joined = f"{base}_{index}"
+        return joined if joined in NAMES else base + index
+    if tag == "mrow" and parts and parts[0].text in FENCES:
+        return f"{FENCES[parts[0].text]}({''.join(map(said, parts[1:-1]))})"
+    if len(parts) == 2 and parts[0].text == "{":
+        (then, condition), (other, _) = ([*map(said, row)] for row in parts[1])
+        return f"where({condition.removeprefix('where ')}, {then}, {other})"
+    return "".join(map(said, parts))
+
+
+def same(text, condition=False):
+    """Whether the MathML of a formula has the formula's value."""
+    drawn = m.formula(text, NAMES, condition)
+    meant = said(ET.fromstring(m.block(drawn)))
+    a, b = (Oracle(NAMES)(t) for t in (text, meant))
+    return bool(np.isclose(a, b, rtol=1e-9, equal_nan=True)), meant
+
+
+NUMBERS = st.sampled_from(["0", "1", "2", "0.5", "3.25", "1e-07", "2e+20"])
+LEAVES = st.one_of(NUMBERS, st.sampled_from([*NAMES, "pi", "e"]))
+
+
+TWO = st.sampled_from(["+", "-", "*", "/", "**"])
+ONE = st.sampled_from(sorted(name for name, count in FORMULA_FUNCTIONS.items() if count == 1))
+
+
+def grown(inner):
+    return st.one_of(
+        st.tuples(inner, TWO, inner).map(lambda t: f"({t[0]}){t[1]}({t[2]})"),
+        st.tuples(inner, TWO, LEAVES).map(lambda t: f"{t[0]}{t[1]}{t[2]}"),
+        inner.map(lambda t: f"-{t}"),
+        st.tuples(ONE, inner).map(lambda t: f"{t[0]}({t[1]})"),
+        st.tuples(inner, st.sampled_from(["<", "<=", "=="]), inner, inner).map(
+            lambda t: f"where({t[0]} {t[1]} {t[2]}, {t[3]}, 2)"
+        ),
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.recursive(LEAVES, grown, max_leaves=9))
+def test_what_is_drawn_means_what_was_written(text):
+    if m.formula(text, NAMES) is not None:  # else a constant in it is not finite
+        good, meant = same(text)
+        assert good, f"{text} is drawn as {meant}"
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["(x + theta)**2", "-x*theta", "-(x - theta)", "(-x + theta)*k12", "x - (theta - k12)", "2**-x",
+     "x/(theta*k12)*2", "-x**2", "(-x)**2", "(x/2)**2", "2*3*x", "x*(theta/2)**2", "x - -theta"],
+)  # fmt: skip
+def test_signs_and_brackets(text):
+    assert same(text)[0], same(text)[1]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["x < 1 and theta > 2 or x == 3", "(x < 1 or theta > 2) and x < 3", "not (x < 1 and x > 0)",
+     "not x < 1", "x < 1 and x > 0 and theta < 0", "x <= 1 or x > 0 or theta < 0"],
+)  # fmt: skip
+def test_conditions(text):
+    assert same(text, True)[0], same(text, True)[1]
+
+
+def test_wrong_mathematics_is_noticed():
+    """The reader tells a bracket that is missing: else the tests above test nothing."""
+    wrong = m.formula("x + theta*2", NAMES)
+    assert said(ET.fromstring(m.block(wrong))) != said(
+        ET.fromstring(m.block(m.formula("(x + theta)*2", NAMES)))
+    )
+
+
+def test_names_are_set_as_people_write_them():
+    assert m.name("theta") == "<mi>θ</mi>"
+    assert m.name("x_1") == "<msub><mi>x</mi><mn>1</mn></msub>"
+    assert m.name("k12") == "<msub><mi>k</mi><mn>12</mn></msub>"
+    assert m.name("omega_max") == "<msub><mi>ω</mi><mi>max</mi></msub>"
+    for odd in ("_", "__a", "a_", "a_b_c", "_1"):
+        assert "".join(ET.fromstring(f"<math>{m.name(odd)}</math>").itertext()) == odd
+
+
+def test_what_is_too_long_or_no_formula_is_text():
+    long = "+".join(["x"] * 300)
+    assert m.formula(long, NAMES) is None
+    assert m.shown(long, NAMES).startswith("<mtext>x+x")
+    assert m.shown("<script>", NAMES) == "<mtext>&lt;script&gt;</mtext>"
+    assert m.formula("x +", NAMES) is None
