@@ -84,11 +84,13 @@ def heading(data: PlainData) -> str:
         "</li>"
         for name, value, more in cards
     )
+    message = str(result["message"])
+    message = text(message[:1].upper() + message[1:])
     return (
         f"<header><h1>{text(data['problem']['name'] or 'A stabilization problem')}</h1>"
         f'<p class="status {text(result["status"])}"><span aria-hidden="true">{sign}</span> '
         f"<strong>{word}</strong>: {text(meaning)}.</p>"
-        f"<p>{text(result['message'][:1].upper() + result['message'][1:])}</p><ul class='figures'>{figures}</ul>{_checked(data)}"
+        f"<p>{message}</p><ul class='figures'>{figures}</ul>{_checked(data)}"
         "</header>"
     )
 

@@ -13,9 +13,8 @@ import lmdsl as lm
 
 pytestmark = [browser, pytest.mark.long]
 
-EVIL = (
-    "</script><script>document.title='gone'</script><img src=x onerror=\"document.title='gone'\">"
-)
+ACT = "document.title='gone'"
+EVIL = f'</script><script>{ACT}</script><img src=x onerror="{ACT}">'
 
 
 @pytest.fixture(scope="module")
@@ -42,17 +41,17 @@ def test_everything_is_drawn_and_nothing_is_complained_of(pages):
 
 
 def test_the_run_that_an_address_names_is_that_of_the_compiled_steps(pages, solved):
-    result = solved("maze")
+    result = solved("standard")
     cell = int(np.argmax(np.where(result.cell_status == 1, result.value, 0)))
     x, y = (float(v) for v in result.partition.centres(np.array([cell]))[0])
     path = result.closed_loop.path([x, y], 50, as_compiled=True)
     assert len(path) > 3
-    text = re.sub(r"<[^>]+>", " ", dom(pages("maze"), f"#start={x!r},{y!r}"))
+    text = re.sub(r"<[^>]+>", " ", dom(pages("standard"), f"#start={x!r},{y!r}"))
     assert f"reached A after {len(path) - 1} steps" in text
 
 
 def test_a_cell_answers(pages, solved):
-    """Point at a cell, click it: value, control, where samples go, a run; sliders move the slice."""
+    """Point at a cell, click it: value, control, where samples go, and a run."""
     result = solved("maze")
     cell = int(np.flatnonzero(result.cell_status == 1)[7])
     x, y = result.partition.centres(np.array([cell]))[0]
