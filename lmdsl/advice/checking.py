@@ -5,19 +5,18 @@ from collections.abc import Iterator
 from lmdsl.advice import declaration, jumps, motion, recorded, sizes
 from lmdsl.advice.report import CheckReport, Finding
 from lmdsl.advice.survey import MOST_SETS, Survey
-from lmdsl.common import inputs
-from lmdsl.common.types import Progress
+from lmdsl.common.types import FilePath, Progress
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.assembly.substeps import settled
 from lmdsl.model.grid.partition import Partition
-from lmdsl.problem.problem import Problem
+from lmdsl.problem import Problem, given
 from lmdsl.systems import MatrixSystem
 
 
 @own_arithmetic
 def check(
-    problem: Problem,
+    problem: Problem | FilePath,
     *,
     time_limit: float | Deadline | None = None,
     progress: Progress | None = None,
@@ -30,7 +29,7 @@ def check(
     Parameters
     ----------
     problem
-        A problem.
+        A problem, or the path of its file.
     time_limit
         Seconds.
     progress
@@ -43,7 +42,7 @@ def check(
     TimeLimitReached
         The time limit was reached.
     """
-    inputs.kind(problem, Problem, "problem", "a Problem")
+    problem = given(problem)
     deadline = Deadline.of(time_limit)
     if progress:
         progress("check", -1.0)

@@ -61,7 +61,10 @@ def _of_equation(
         "over it, and only where a step ends is judged"
     )
     figures: dict[str, Any] = {"landing": landed, "jumping": over}
-    remedy = 'write "judged": "path" in system, so that a step that enters A on the way counts'
+    remedy = (
+        'write "judged": "path" in system, so that a step that enters the attractor on the way '
+        "counts"
+    )
     if then is not None and share is not None:
         figures |= {"share": share, "share_then": then}
         remedy += (

@@ -1,5 +1,7 @@
-"""What there is, and where to start: ``schema``, ``systems``, ``init``, ``backends``."""
+"""What there is, and where to start: ``schema``, ``systems``, ``init``, and others."""
 
+import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +23,8 @@ def add(command: Command) -> None:
     init.add_argument("--out", metavar="FILE",
                       help="file to write (default NAME.json; own_system.py or .json)")  # fmt: skip
     shared(command("backends", _backends, "List the backends."), "--json")
+    completion = command("completion", _completion, "Print what completes commands in a shell.")
+    completion.add_argument("shell", metavar="SHELL", help="bash, zsh or tcsh")
 
 
 def _schema(parsed: Arguments) -> int:
@@ -110,3 +114,34 @@ def _backends(parsed: Arguments) -> int:
         else:
             say(f"{name.ljust(width)}  not available: {entry['reason']}")
     return 0
+
+
+def _completion(parsed: Arguments) -> int:
+    try:
+        import shtab
+    except ImportError:
+        message = 'shtab is not installed; pip install "lmdsl[completion]"'
+        raise BadInput(message, "completion") from None
+    if parsed.shell not in shtab.SUPPORTED_SHELLS:
+        known = ", ".join(shtab.SUPPORTED_SHELLS)
+        raise BadInput(f"{shown(parsed.shell)} is not a shell that is known: {known}", "SHELL")
+    say(shtab.complete(_completed(shtab.FILE, shtab.SUPPORTED_SHELLS), parsed.shell))
+    return 0
+
+
+def _completed(file: Any, shells: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser of the command line, with what may stand where a name or a file does."""
+    from lmdsl import backends
+    from lmdsl.cli import _parser
+    from lmdsl.systems import NAMED
+
+    parser = _parser()
+    choices = {"name": list(NAMED), "backend": backends.names(), "shell": shells}
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    for command in commands.choices.values():
+        for action in command._actions:
+            if action.metavar in ("FILE", "DIR"):
+                action.complete = file
+            elif action.dest in choices:
+                action.choices = choices[action.dest]
+    return parser

@@ -31,12 +31,12 @@ def add(command: Command) -> None:
     simulate.add_argument("--steps", type=int, default=10_000, metavar="T")
     simulate.add_argument("--seed", type=int, default=0, metavar="S")
     simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
-                          help="with a local controller, steps after reaching A")  # fmt: skip
+                          help="with a local controller, steps after the arrival")  # fmt: skip
     simulate.add_argument("--as-compiled", action="store_true",
                           help="follow the compiled steps and noise nodes")  # fmt: skip
     shared(simulate, "--time-limit", "--json")
 
-    prove = command("prove", _prove, "Prove what becomes of C on the true map, by volume.")
+    prove = command("prove", _prove, "Prove what the controller does on the true map, by volume.")
     shared(prove, "dir")
     prove.add_argument("--target", type=float, default=0.999, metavar="T",
                        help="share that is to arrive (default 0.999)")  # fmt: skip

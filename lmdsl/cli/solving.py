@@ -44,7 +44,7 @@ def add(command: Command) -> None:
     solve.add_argument("--restrict-to-gamma", action="store_true",
                        help="solve on the cells for which gamma is feasible")  # fmt: skip
     solve.add_argument("--proved", type=float, metavar="T",
-                       help="repair until this share of C is proved to arrive")  # fmt: skip
+                       help="repair until this share of cells is proved to arrive")  # fmt: skip
     solve.add_argument("--out", metavar="DIR", help="write controller and certificate to DIR")
     solve.add_argument("--no-simulate", dest="simulate", action="store_false",
                        help="make no runs of the true map")  # fmt: skip
@@ -160,7 +160,7 @@ def _summary(result: Any) -> str:
         ("cells", f"{result.cells} = {result.attractor_cells} attractor + "
                   f"{result.stabilizable_cells} stabilizable + {_others(result)}"),
         ("coverage", str(result.coverage)),
-        ("pairs", f"{result.pairs} surviving, {result.controls} controls"),
+        ("pairs", f"{result.pairs} usable (cell, control), {result.controls} controls"),
         ("gamma", f"{result.gamma!r}"),
     ]  # fmt: skip
     if result.problem.discount is not None:
@@ -173,7 +173,7 @@ def _summary(result: Any) -> str:
             *([("reward", number(result.reward))] if result.reward is not None else []),
             ("gap", f"{number(result.gap, '.2g')} (tolerance {number(result.tolerance, '.2g')})"),
             ("contraction", number(result.contraction)),
-            ("polish steps", str(result.polish_steps)),
+            ("improved", _improved(result.polish_steps)),
         ]
     if result.sure_cells is not None:
         rows.append(("enclosed", _enclosed(result)))
@@ -192,6 +192,12 @@ def _summary(result: Any) -> str:
     return "\n".join([*lines, "", printable(result.message)])
 
 
+def _improved(steps: int | None) -> str:
+    if steps is None:
+        return "not established"
+    return f"{steps} time{'s' * (steps != 1)} after the backend"
+
+
 def _enclosed(result: Any) -> str:
     sure = f"some controller surely arrives from {result.sure_cells} cells"
     safe = result.claims.get("safe")
@@ -201,7 +207,7 @@ def _enclosed(result: Any) -> str:
     if safe == "assumed":
         claim = "no run is lost, assuming the Lipschitz constants (claim 7 is assumed, not proved)"
     missed = _missed(result) if safe else ""
-    return f"{claim}{missed}; {sure}; the lower bound speaks of surviving pairs"
+    return f"{claim}{missed}; {sure}; the lower bound speaks of usable pairs"
 
 
 def _missed(result: Any) -> str:
@@ -234,7 +240,7 @@ def _others(result: Any) -> str:
     named = {
         CellStatus.ESCAPES: "escaping",
         CellStatus.TRAPPED: "trapped",
-        CellStatus.LEADS_TO_THESE: "leading to these",
+        CellStatus.LEADS_TO_THESE: "leading to lost cells",
         CellStatus.AVOID: "avoid",
         CellStatus.BEYOND_GAMMA: "beyond gamma",
     }

@@ -1,5 +1,6 @@
 """Names of types for every package: arrays by what they hold, and callables of the caller's."""
 
+import os
 from collections.abc import Callable
 
 import numpy as np
@@ -10,6 +11,8 @@ Bools = NDArray[np.bool_]
 Indices = NDArray[np.int64]  # whole numbers, such as cells, positions or columns
 Statuses = NDArray[np.uint8]  # codes of ``CellStatus``, by cell
 Policy = NDArray[np.int64]  # a column per position of C, shape (n,)
+
+FilePath = str | os.PathLike[str]
 
 TimeUp = Callable[[], bool]  # asked now and then by what takes long: True ends the work early
 # Told what is being done, and which part of it, 0 to 1, is done.

@@ -8,7 +8,7 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
-from lmdsl.common.types import Bools, Progress, Statuses
+from lmdsl.common.types import Bools, FilePath, Progress, Statuses
 from lmdsl.errors import BadInput, shown
 from lmdsl.explanation import finite, one_cell, whole_cell
 from lmdsl.explanation.changes import every_hint
@@ -31,7 +31,7 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import LOST, CellStatus
-from lmdsl.problem.problem import Problem
+from lmdsl.problem import Problem, given
 from lmdsl.systems import MatrixSystem
 
 
@@ -194,7 +194,7 @@ class Explanation(Frozen):
     def text(self) -> str:
         """Return the explanation for people."""
         stabilizable = int((self.cell_status == CellStatus.STABILIZED).sum())
-        lines = [f"{self.lost} of {self.lost + stabilizable} cells outside A and avoid cannot be "
+        lines = [f"{self.lost} of {self.lost + stabilizable} free cells cannot be "
                  "stabilized"]  # fmt: skip
         meaning = meanings(self.problem)
         finite_model = isinstance(self.problem.system, MatrixSystem)
@@ -221,7 +221,7 @@ class Explanation(Frozen):
 
 @own_arithmetic
 def explain(
-    problem: Problem | StabilizationLP,
+    problem: Problem | StabilizationLP | FilePath,
     *,
     regions: int = 8,
     phase_one: bool = False,
@@ -233,7 +233,7 @@ def explain(
     Parameters
     ----------
     problem
-        A problem, or its compiled LP. Its gamma plays no part, but in the phase-one LP.
+        A problem, the path of its file, or its LP; gamma plays a part in the phase-one LP only.
     regions
         Largest number of boxes for each cause.
     phase_one
@@ -252,7 +252,7 @@ def explain(
     LmdslError
         The phase-one LP is not solved.
     """
-    inputs.kind(problem, (Problem, StabilizationLP), "problem", "a Problem or a compiled LP")
+    problem = given(problem, StabilizationLP)
     deadline = Deadline.of(time_limit)
     regions, phase_one = inputs.whole(regions, "regions"), inputs.flag(phase_one, "phase_one")
     assembled = None

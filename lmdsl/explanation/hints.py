@@ -190,9 +190,9 @@ def _finer(trial: _Trial, cells: Indices, finer: Bools, staying: Floats) -> list
     trapped = int((of == CellStatus.TRAPPED).sum())
     text = (
         f"a finer grid (or more sample points): from {count} of {tried} cells tried the true map "
-        f"reaches C or A from every sample point under held controls without leaving the box; "
-        f"{trapped} of them are trapped; the share of samples that stay in their own cell is at "
-        f"least {own:.3g} under every control (median of these cells)"
+        f"reaches stabilizable cells or the attractor from every sample point under held controls "
+        f"without leaving the box; {trapped} of them are trapped; the share of samples that stay "
+        f"in their own cell is at least {own:.3g} under every control (median of these cells)"
     )
     numbers = {"cells": count, "tried": tried, "trapped": trapped, "own_cell_share": own}
     return [Hint("finer grid", text, numbers)]
@@ -219,8 +219,8 @@ def _larger(trial: _Trial, open_: Bools, arrived: Bools, most: Floats) -> list[H
         text = (
             f"a larger box: from {count} of {tried} cells tried the true map goes "
             f"{'above' if end == 'high' else 'below'} {name} = {place:.6g} only and comes back "
-            f"to C or A under a held control; 90 % of these stay within {name} = {to:.6g} "
-            f"({far:.3g} beyond, {100 * far / span:.3g} % of the axis)"
+            f"to stabilizable cells or the attractor under a held control; 90 % of these stay "
+            f"within {name} = {to:.6g} ({far:.3g} beyond, {100 * far / span:.3g} % of the axis)"
         )
         numbers = {
             "cells": count, "tried": tried, "axis": name, "end": end,

@@ -9,8 +9,9 @@ from lmdsl.systems import MatrixSystem
 MEANING = {
     CellStatus.ESCAPES: "every control sends some sample out of the box, into avoid, or to "
     "a value that is not finite",
-    CellStatus.TRAPPED: "A cannot be reached through admissible pairs",
-    CellStatus.LEADS_TO_THESE: "A can be reached, but not without the risk of a cell that is lost",
+    CellStatus.TRAPPED: "the attractor cannot be reached by controls that are safe",
+    CellStatus.LEADS_TO_THESE: "the attractor can be reached, but not without the risk of a cell "
+    "that is lost",
 }
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen, freeze
-from lmdsl.common.types import Floats, Indices, Progress, Statuses
+from lmdsl.common.types import FilePath, Floats, Indices, Progress, Statuses
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
@@ -34,8 +34,8 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.successors.left_out.dropping import left_out
 from lmdsl.model.successors.survival import Successors
+from lmdsl.problem import Problem, given
 from lmdsl.problem.changing import with_gamma_alone
-from lmdsl.problem.problem import Problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -254,7 +254,7 @@ class StabilizationLP(Frozen):
 
 @own_arithmetic
 def compile(  # noqa: A001
-    problem: Problem, progress: Progress | None = None,
+    problem: Problem | FilePath, progress: Progress | None = None,
     time_limit: float | Deadline | None = None, *, dropped: Any = None,
 ) -> StabilizationLP:  # fmt: skip
     """Compile a problem: transitions, stabilizable set and the LP on it.
@@ -262,7 +262,7 @@ def compile(  # noqa: A001
     Parameters
     ----------
     problem
-        The declared problem.
+        The declared problem, or the path of its file.
     progress
         Called with (stage, fraction done) during long work.
     time_limit
@@ -278,8 +278,7 @@ def compile(  # noqa: A001
         A set has no cells, a cost is negative or not finite, or memory does not suffice.
     """
     deadline = Deadline.of(time_limit)
-    inputs.kind(problem, Problem, "problem", "a Problem")
-    problem = settled(problem, deadline)
+    problem = settled(given(problem), deadline)
     partition = Partition.of(problem)
     require_least(problem)
     limit = unless_short(problem, deadline)

@@ -1,7 +1,10 @@
 """What a user declares: one model per key of a problem file."""
 
-from typing import Any
+import os
+from typing import Any, TypeVar, overload
 
+from lmdsl.common import inputs
+from lmdsl.common.types import FilePath
 from lmdsl.problem.axes import Axis
 from lmdsl.problem.controls import ControlRange, ControlValues
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
@@ -13,8 +16,33 @@ from lmdsl.problem.sets import Attractor, Avoid, Measure
 __all__ = [
     "Attractor", "Avoid", "Axis", "ConstantControl", "ControlRange", "ControlValues", "Grid",
     "LinearFeedback", "LqrFeedback", "Measure", "NoiseNormal", "NoiseValues", "Problem", "Random",
-    "Sobol", "json_schema", "load",
+    "Sobol", "given", "json_schema", "load",
 ]  # fmt: skip
+
+Compiled = TypeVar("Compiled")
+
+
+@overload
+def given(problem: Problem | FilePath) -> Problem: ...
+
+
+@overload
+def given(
+    problem: Problem | Compiled | FilePath, compiled: type[Compiled]
+) -> Problem | Compiled: ...
+
+
+def given(problem: Any, compiled: Any = None) -> Any:
+    """Return the problem that an argument stands for: it may be the path of a problem file.
+
+    Where a class of compiled problems is named, one of these is returned as it is.
+    """
+    if isinstance(problem, str | os.PathLike):
+        return load(problem)
+    kinds = (Problem,) if compiled is None else (Problem, compiled)
+    wanted = "a Problem or the path of a problem file"
+    inputs.kind(problem, kinds, "problem", wanted + ", or a compiled LP" * (len(kinds) - 1))
+    return problem
 
 
 def json_schema() -> dict[str, Any]:

@@ -237,7 +237,7 @@ class Proof(Frozen):
         what = f"to arrive, {lost}, {stays} elsewhere" if not self.to_stay else f"to stay, {lost}"
         share = self.stays if self.to_stay else self.arrives
         lines = [
-            f"of the volume of C {_percent(share)} is proved {what}; "
+            f"of the volume that is controlled {_percent(share)} is proved {what}; "
             f"{_percent(self.undecided)} is undecided"
         ]
         if self.cost is not None:
@@ -248,7 +248,7 @@ class Proof(Frozen):
             )
         if self.probability is not None:
             lines.append(
-                f"  with its noise a run from C arrives with a probability of at least "
+                f"  with its noise a run from there arrives with a probability of at least "
                 f"{self.probability:.6g}"
             )
         if self.optimum is not None:
@@ -267,7 +267,7 @@ class Proof(Frozen):
         ]
         held = {True: "proved", False: "refuted by a run", None: "not proved"}[self.holds]
         if not self.to_stay:
-            lines.append(f"  that what arrives stays in A is {held}")
+            lines.append(f"  that what arrives stays in the attractor is {held}")
         lines.append(f"  {self.boxes:,} boxes, {self.seconds:.1f} s; target {self.target:.6g} is "
                      f"{'reached' if self.reached else 'not reached'}")  # fmt: skip
         return "\n".join(lines)

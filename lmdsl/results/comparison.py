@@ -9,13 +9,13 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.records import Reported
-from lmdsl.common.types import Progress
+from lmdsl.common.types import FilePath, Progress
 from lmdsl.errors import BadInput, printable, shown
 from lmdsl.machine.deadline import TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.optimize.policies import bellman
-from lmdsl.problem.problem import Problem
+from lmdsl.problem import Problem, given
 from lmdsl.results.job import not_compiled
 from lmdsl.results.result import Result
 from lmdsl.results.solving import TOLERANCE, solve
@@ -107,7 +107,7 @@ def _row(result: Result) -> tuple[str, ...]:
 
 @own_arithmetic
 def compare(
-    problem: Problem | StabilizationLP,
+    problem: Problem | StabilizationLP | FilePath,
     backends: Sequence[Any] = BACKENDS,
     *,
     tolerance: float = TOLERANCE,
@@ -119,7 +119,7 @@ def compare(
     Parameters
     ----------
     problem
-        A problem, or its compiled LP.
+        A problem, the path of its file, or its compiled LP.
     backends
         As for :func:`lmdsl.solve`, each alone or with an algorithm: ``"highs:simplex"``.
     tolerance, progress
@@ -135,8 +135,7 @@ def compare(
     if isinstance(backends, str):
         raise BadInput(f"name the backends in a list: [{shown(backends)}]", "backends")
     inputs.kind(backends, Sequence, "backends", "a list of backends")
-    if not isinstance(problem, Problem | StabilizationLP):
-        raise BadInput(f"{shown(problem)} is neither a Problem nor a compiled LP", "problem")
+    problem = given(problem, StabilizationLP)
     if not backends:
         raise BadInput("no backend is named; name at least one", "backends")
     if isinstance(problem, Problem):

@@ -14,7 +14,7 @@ from lmdsl.backends.asking import ask
 from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Verified, Witness
 from lmdsl.common import inputs
-from lmdsl.common.types import Progress
+from lmdsl.common.types import FilePath, Progress
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
@@ -23,7 +23,7 @@ from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility import first_policy, gamma_bar, lifting, restriction
 from lmdsl.optimize.witness import certify
-from lmdsl.problem.problem import Problem
+from lmdsl.problem import Problem, given
 from lmdsl.results.job import _Job, not_compiled
 from lmdsl.results.polishing import _Outcome, _polish
 from lmdsl.results.result import Result
@@ -34,7 +34,7 @@ TOLERANCE = 1e-6  # default gap above which a result is not verified
 
 @own_arithmetic
 def solve(
-    problem: Problem | StabilizationLP,
+    problem: Problem | StabilizationLP | FilePath,
     backend: str | Backend = backends.DEFAULT,
     *,
     tolerance: float = TOLERANCE,
@@ -51,7 +51,7 @@ def solve(
     Parameters
     ----------
     problem
-        A problem, or the LP of :func:`lmdsl.compile`.
+        A problem, the path of its file, or the LP of :func:`lmdsl.compile`.
     backend
         ``"policy-iteration"``, ``"highs"``, ``"clarabel"``, ``"cvxpy"``, one of your own, each
         optionally with an algorithm (``"highs:simplex"``, ``"cvxpy:SCS"``), or a Backend.
@@ -88,7 +88,8 @@ def solve(
     BadInput
         The problem or an option cannot be used.
     """
-    _check_options(problem, tolerance, max_iterations)
+    problem = given(problem, StabilizationLP)
+    _check_options(tolerance, max_iterations)
     require_all = inputs.flag(require_all, "require_all")
     restrict_to_gamma = inputs.flag(restrict_to_gamma, "restrict_to_gamma")
     if restrict_to_gamma:
@@ -236,9 +237,7 @@ def _asked(
     return solution, outcome
 
 
-def _check_options(problem: Any, tolerance: Any, max_iterations: Any) -> None:
-    if not isinstance(problem, Problem | StabilizationLP):
-        raise BadInput(f"{shown(problem)} is neither a Problem nor a compiled LP", "problem")
+def _check_options(tolerance: Any, max_iterations: Any) -> None:
     if not inputs.is_number(tolerance) or not 0 <= tolerance < 1e300:
         raise BadInput(f"{shown(tolerance)} must be a finite number >= 0", "tolerance")
     if max_iterations is not None:
@@ -290,7 +289,7 @@ def _not_stabilizable(
     if require_all and outside:
         return (
             Cause.REQUIRE_ALL,
-            f"{outside} of {lp.n + outside} cells outside A and Z are not stabilizable",
+            f"{outside} of {lp.n + outside} free cells are not stabilizable",
         )
     return None
 

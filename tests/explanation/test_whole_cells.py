@@ -124,7 +124,7 @@ def test_reports_say_what_is_claimed(tmp_path, capsys):
     told = capsys.readouterr().out
     assert "no run of the map as compiled is lost (claim 7)" in told
     assert "some controller surely arrives from 1 cells" in told
-    assert "the lower bound speaks of surviving pairs" in told
+    assert "the lower bound speaks of usable pairs" in told
     assert main(["verify", str(tmp_path / "out")]) == 0
     assert "safe of the map as compiled" in capsys.readouterr().out
 

@@ -220,7 +220,7 @@ def test_without_an_attractor_staying_is_the_target():
     assert proof.arrives == 0
     assert proof.reached
     assert str(proof).startswith(
-        "of the volume of C 100.0000 % is proved to stay, 0.0000 % to be lost"
+        "of the volume that is controlled 100.0000 % is proved to stay, 0.0000 % to be lost"
     )
     assert "elsewhere" not in str(proof)
     assert "stays in A" not in str(proof)

@@ -27,7 +27,7 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
-from lmdsl.common.types import Floats, Policy, Progress, TimeUp, never
+from lmdsl.common.types import FilePath, Floats, Policy, Progress, TimeUp, never
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, Stopped
 from lmdsl.machine.surroundings import own_arithmetic
@@ -44,7 +44,7 @@ from lmdsl.optimize.feasibility.infeasible import (
     exhausted_by_levels,
 )
 from lmdsl.optimize.feasibility.spectral_radius import PolicyClasses
-from lmdsl.problem.problem import Problem
+from lmdsl.problem import Problem, given
 
 # How far beyond the limit of a policy optimal stopping is asked where doubles decide no nearer.
 FARTHER = (1e-5, 1e-3, 0.1, 1.0)
@@ -134,7 +134,7 @@ CORNER = (
 
 @own_arithmetic
 def gamma_max(
-    problem: Problem | StabilizationLP,
+    problem: Problem | StabilizationLP | FilePath,
     progress: Progress | None = None,
     time_limit: float | Deadline | None = None,
     width: float = WIDTH,
@@ -144,7 +144,7 @@ def gamma_max(
     Parameters
     ----------
     problem
-        A problem, or its compiled LP; its own gamma plays no part.
+        A problem, the path of its file, or its compiled LP; its own gamma plays no part.
     progress
         Called with (stage, fraction done, or -1).
     time_limit
@@ -165,7 +165,7 @@ def gamma_max(
     TimeLimitReached
         It was not compiled in time.
     """
-    inputs.kind(problem, (Problem, StabilizationLP), "problem", "a Problem or a compiled LP")
+    problem = given(problem, StabilizationLP)
     if not inputs.is_number(width) or not LEAST_WIDTH <= width <= 1:
         raise BadInput(f"{shown(width)} must be a number from {LEAST_WIDTH} to 1", "width")
     deadline = Deadline.of(time_limit)
