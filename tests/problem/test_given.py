@@ -51,5 +51,5 @@ def test_what_is_no_problem_is_refused(verb, tmp_path):
 
 
 def test_what_is_compiled_already_is_no_problem_to_compile():
-    with pytest.raises(lm.BadInput, match="a Problem or the path of a problem file$"):
+    with pytest.raises(lm.BadInput, match=r"a Problem or the path of a problem file$"):
         lm.compile(lm.compile(PROBLEM))

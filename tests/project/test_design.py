@@ -8,6 +8,7 @@ import inspect
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import house
@@ -209,6 +210,15 @@ def test_the_reference_shares_no_code():
     for path in files:
         assert {*imported_by(path)} <= known, path.name
         assert len(path.read_text().splitlines()) <= 320, path.name
+
+
+def test_all_is_what_people_use():
+    project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    (listed,) = extras["all"]
+    found = re.fullmatch(r"lmdsl\[(.*)\]", listed)[1].split(",")
+    ours = {"all", "bench", "docs", "lint", "notebooks", "peers", "test"}
+    assert sorted(found) == sorted({*extras} - ours)
 
 
 def test_no_file_is_too_long():

@@ -8,7 +8,8 @@ What is checked of README.md, CONTRIBUTING.md, CHANGELOG.md and docs/*.md:
 - ``console`` blocks: each line ``$ lmdsl ...`` with output below it is run, and the output
   compared; ``$ echo $?`` states the exit status (0 where it is not stated). Without output the
   command line is only parsed.
-- ``<!-- no-run: reason -->`` on the line before a block leaves it out.
+- ``<!-- no-run: reason -->`` on the line before a block leaves it out; ``<!-- needs: package -->``
+  does where the package is missing.
 - In outputs ``...`` stands for anything, and runs of blanks count as one.
 - Relative links lead to a file, and to a heading of it.
 
@@ -20,6 +21,7 @@ from __future__ import annotations
 
 import contextlib
 import doctest
+import importlib.util
 import io
 import re
 import shlex
@@ -83,7 +85,9 @@ def test_blocks_run(path, tmp_path, monkeypatch):
     for block in blocks(path.read_text()):
         where = f"{path.name}, line {block.line}"
         last, printed = printed, None
-        if block.before.startswith("<!-- no-run:"):
+        needed = re.match(r"<!-- needs: (\w+) -->", block.before)
+        absent = needed is not None and importlib.util.find_spec(needed[1]) is None
+        if block.before.startswith("<!-- no-run:") or absent:
             continue
         if block.language == "python":
             code = compile("\n" * (block.line - 1) + block.text, str(path), "exec")

@@ -1,0 +1,88 @@
+"""The site: what its configuration makes of the pages, and the words that are explained."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import runpy
+
+import pytest
+from pages import ROOT, missing
+
+import lmdsl as lm
+from lmdsl.cli import solving
+from lmdsl.data.report import DataReport
+from lmdsl.explanation.one_cell import NAMES
+from lmdsl.model.stabilizable_set import LOST
+
+CONF = runpy.run_path(str(ROOT / "docs/conf.py"))
+INDEX = (ROOT / "docs/index.md").read_text()
+WORDS = (ROOT / "docs/words.md").read_text()
+
+
+def test_every_page_has_one_place_in_the_navigation():
+    listed = [page for pages in CONF["parts"](INDEX).values() for page in pages]
+    pages = [path.stem for kind in ("md", "rst") for path in (ROOT / "docs").glob(f"*.{kind}")]
+    assert sorted([*listed, "index"]) == sorted(pages)
+
+
+def test_a_new_page_gets_its_place():
+    text = "# x\n\n## Start\n\n| page | what |\n|---|---|\n| [New](new.md) | ? |\n\n## Other\n"
+    assert CONF["parts"](text) == {"Start": ["new"], "Other": []}
+    source = [f"{text}see [changes](../CHANGELOG.md)\n"]
+    CONF["with_navigation"](None, "index", source)
+    assert ":caption: Start\n\nnew\n" in source[0]
+    assert "(path:../CHANGELOG.md)" in source[0]
+
+
+def test_every_public_name_is_in_the_reference():
+    text = CONF["reference"]()
+    for name in lm.__all__:
+        item = getattr(lm, name)
+        if inspect.ismodule(item):
+            own = [x for x in getattr(item, "__all__", []) if callable(getattr(item, x))]
+            assert all(f":: lmdsl.{name}.{x}\n" in text for x in own), name
+        elif callable(item):
+            assert f":: lmdsl.{name}\n" in text, name
+
+
+# Words ------------------------------------------------------------------------------------------
+
+
+def labels(function) -> list[str]:
+    """The names of the lines that a function prints."""
+    return re.findall(r'\(\s*"([a-z_]+(?: [a-z_]+)*)",', inspect.getsource(function))
+
+
+def test_every_line_of_a_report_is_explained():
+    lines = [*labels(solving._summary), *labels(DataReport.rows)]
+    assert {"problem", "pairs", "improved", "gamma_bar", "assumes", "true cost"} <= {*lines}
+    assert not missing(lines, WORDS)
+
+
+def test_every_cause_is_explained():
+    plain = WORDS.replace("*", "")
+    for status in LOST:
+        assert NAMES[status] in plain, NAMES[status]
+    for word in re.findall(r'CellStatus\.\w+: "([a-z ]+)"', inspect.getsource(solving._others)):
+        assert word in plain, word
+
+
+@pytest.mark.parametrize("module", ["results.comparison", "control.simulation"])
+def test_every_column_and_line_of_other_reports_is_explained(module):
+    source = inspect.getsource(importlib.import_module(f"lmdsl.{module}"))
+    if module == "results.comparison":
+        head = re.search(r"head = \((.*?)\)", source, re.DOTALL)
+        found = re.findall(r'"([a-z ]+)"', head[1])
+    else:
+        found = re.findall(r'f?"  ([a-z]+(?: [a-z]+)*) {2,}\{', source)
+    assert len(found) > 3
+    known = WORDS.replace("*", "")
+    assert not [word for word in found if word not in known]
+
+
+def test_letters_of_the_mathematics_are_not_printed():
+    """A, Z and C are for formulas; the reports of the command line say what they stand for."""
+    for text in (inspect.getsource(solving._summary), inspect.getsource(solving._enclosed)):
+        assert not re.search(r'"[^"]*\b[AZC]\b[^"]*"', text)
