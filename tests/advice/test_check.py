@@ -301,7 +301,7 @@ def test_a_discounted_problem_needs_no_attractor_and_no_step():
 
 def test_what_is_no_problem_is_refused():
     with pytest.raises(lm.BadInput, match="a Problem"):
-        lm.check("problem.json")
+        lm.check({"problem": 1})
 
 
 def test_boxes_of_an_attractor_across_the_seam():

@@ -214,7 +214,7 @@ def test_what_has_no_such_knob_is_refused():
     with pytest.raises(lm.BadInput, match="finite model"):
         lm.study(finite, cells=[3])
     with pytest.raises(lm.BadInput, match="not a Problem"):
-        lm.study("problem.json")
+        lm.study({"problem": 1})
 
 
 def test_a_study_as_data_and_as_a_table(tmp_path):

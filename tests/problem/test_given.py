@@ -30,6 +30,7 @@ def test_verbs_take_a_path(path, kind):
     assert lm.explain(kind(path)).lost == 0
     assert lm.explain(kind(path), phase_one=True).phase_one.total == pytest.approx(0)
     assert lm.check(kind(path)).axes == {"x": 4}
+    assert len(lm.study(kind(path), gamma=[1.0], starts=0).rows) == 1
 
 
 def test_what_is_compiled_is_taken_as_it_is(path):
@@ -39,7 +40,7 @@ def test_what_is_compiled_is_taken_as_it_is(path):
 
 
 @pytest.mark.parametrize("verb", [lm.compile, lm.solve, lm.compare, lm.gamma_max, lm.explain,
-                                  lm.check])  # fmt: skip
+                                  lm.check, lm.study])  # fmt: skip
 def test_what_is_no_problem_is_refused(verb, tmp_path):
     for bad in (3, None, {"format": "lmdsl/1"}, [PROBLEM]):
         with pytest.raises(lm.BadInput, match="a Problem or the path of a problem file"):

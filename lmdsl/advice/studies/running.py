@@ -9,13 +9,13 @@ from lmdsl.advice.studies.knobs import Variation, variants
 from lmdsl.advice.studies.orders import orders
 from lmdsl.advice.studies.record import Study, StudyRow
 from lmdsl.common import inputs
-from lmdsl.common.types import Progress
+from lmdsl.common.types import FilePath, Progress
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.lp import StabilizationLP
+from lmdsl.problem import Problem, given
 from lmdsl.problem.changing import gamma_alone
-from lmdsl.problem.problem import Problem
 from lmdsl.results.result import Result
 from lmdsl.results.solving import TOLERANCE, solve
 
@@ -24,7 +24,7 @@ STEPS = 10_000  # step limit of runs
 
 @own_arithmetic
 def study(
-    problem: Problem,
+    problem: Problem | FilePath,
     *,
     cells: Sequence[Any] | None = None,
     samples: Sequence[int] | None = None,
@@ -45,7 +45,7 @@ def study(
     Parameters
     ----------
     problem
-        A problem.
+        A problem, or the path of its file.
     cells
         Numbers of cells: each one number for all axes, numbers in the order of the axes, or numbers
         by name (then the others keep theirs).
@@ -71,9 +71,9 @@ def study(
         A value makes no sense, or the folder is no study's. A variant that is no problem, as cells
         too large for the attractor, is a row with the status ``bad_input``.
     """
-    inputs.kind(problem, Problem, "problem", "a Problem")
-    given = {"cells": cells, "samples": samples, "gamma": gamma, "step": step, "backends": backends}
-    asked = variants(problem, given)
+    problem = given(problem)
+    knobs = {"cells": cells, "samples": samples, "gamma": gamma, "step": step, "backends": backends}
+    asked = variants(problem, knobs)
     options = {"starts": inputs.whole(starts, "starts", 0), "tolerance": tolerance,
                "time_limit": time_limit}  # fmt: skip
     if out is not None and problem.functions:
@@ -127,14 +127,14 @@ class _Work:
 
     def _solved(self, problem: Problem, asked: Variation) -> Result:
         deadline = Deadline.of(self.options["time_limit"])
-        given: Problem | StabilizationLP = problem
+        asked_for: Problem | StabilizationLP = problem
         fresh = not self._at_hand(problem)
         if fresh:
             self.lp = None  # two models need not fit into memory
         elif self.lp is not None:
-            given = self.lp.with_gamma(problem.gamma)
+            asked_for = self.lp.with_gamma(problem.gamma)
         result = solve(
-            given, asked.backend, tolerance=self.options["tolerance"], time_limit=deadline,
+            asked_for, asked.backend, tolerance=self.options["tolerance"], time_limit=deadline,
             start=self._start(), progress=self.progress,
         )  # fmt: skip
         if fresh:
