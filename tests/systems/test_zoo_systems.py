@@ -252,6 +252,25 @@ def test_rantzer_has_equilibria_that_never_arrive(place):
     np.testing.assert_allclose(rate, 0, atol=1e-6)
 
 
+def test_rantzer_comes_home_by_the_horizon():
+    """How many runs are on their way after n steps, by the plain equations alone.
+
+    What passes (2, 0) at a distance x leaves it after log(1/x)/(2/sqrt 5), and waits log(1/x) at
+    either end of the horizon. The mean cost at gamma = 1.02 is near that of the finest grid.
+    """
+    rng = np.random.default_rng(15)
+    x = np.array([rng.uniform(np.pi / 12, np.pi, 40_000), rng.uniform(-np.pi, np.pi, 40_000)])
+    step, left = plain.runge_kutta(plain.rantzer, 0.25, 2), [x.shape[1]]
+    while left[-1]:
+        x = step(x, [], [])
+        x = x[:, x[0] > np.pi / 12]
+        left.append(x.shape[1])
+    decay = (left[30] / left[60]) ** (1 / 30)
+    assert decay == pytest.approx(np.exp(0.25 / (2 + np.sqrt(5) / 2)), rel=0.01)
+    cost = sum(1.02**n * share for n, share in enumerate(left)) / left[0]
+    assert zoo.entries()["rantzer"]["grids"][-1]["cost"] == pytest.approx(cost, rel=0.05)
+
+
 def test_nobody_is_lost_in_an_epidemic():
     """S + I + R stays: what S and I lose together has recovered. S^rho e^(-beta (S + I)) stays."""
     declared = held("epidemic", 4, 64)
