@@ -7,5 +7,6 @@ line here. Nothing is imported before it is asked for.
 # For whom each format is, by name.
 FORMATS = {
     "certificate": "to be checked alone",
+    "c": "the controller, as a C header",
     "drn": "for Storm",
 }
