@@ -8,5 +8,9 @@ line here. Nothing is imported before it is asked for.
 FORMATS = {
     "certificate": "to be checked alone",
     "c": "the controller, as a C header",
+    "onnx": "the controller, as a graph for ONNX Runtime",
+    "csv": "a table of all cells",
     "drn": "for Storm",
+    "umb": "for Storm, PRISM and Modest",
+    "mps": "the LP, for any LP solver",
 }

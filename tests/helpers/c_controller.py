@@ -48,7 +48,7 @@ class CompiledController:
 
 
 def states(result: lm.Result, count: int, seed: int = 0) -> np.ndarray:
-    """Return states within the box and around it, on edges and near them, and some that are none."""
+    """Return states in the box and around it, on edges and near them, and some that are none."""
     rng, partition = np.random.default_rng(seed), result.controller.partition
     low, high, d = partition.low, partition.high, partition.dimension
     x = low - 0.5 * (high - low) + 2 * (high - low) * rng.random((count, d))

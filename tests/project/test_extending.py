@@ -142,11 +142,11 @@ def test_a_backend_is_a_file_and_a_line(copy):
 
 
 def test_an_output_format_is_a_file_and_a_line(copy):
-    copy.file("results/exports/csv.py", FORMAT)
-    copy.line("results/formats.py", '"drn":', '"csv": "for spreadsheets",')
+    copy.file("results/exports/tsv.py", FORMAT)
+    copy.line("results/formats.py", '"drn":', '"tsv": "for spreadsheets",')
     copy.solved(steps())
-    copy.run("export", "out", "--format", "csv", "--out", "values.csv")
-    values = [line.split(",") for line in (copy.folder / "values.csv").read_text().splitlines()]
+    copy.run("export", "out", "--format", "tsv", "--out", "values.tsv")
+    values = [line.split(",") for line in (copy.folder / "values.tsv").read_text().splitlines()]
     assert [int(cell) for cell, _ in values] == [1, 2, 3]
     assert [float(value) for _, value in values] == pytest.approx([1, 2, 3])
     copy.assert_as_documented("an output format")

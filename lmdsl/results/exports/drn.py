@@ -11,10 +11,10 @@ from fractions import Fraction
 
 from lmdsl.common import inputs
 from lmdsl.common.files import write_whole
-from lmdsl.errors import BadInput
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.results.directory.writing import refuse_own_file
+from lmdsl.results.exports.markov import exact_row, last_states, require_model
 from lmdsl.results.result import Result
 
 
@@ -40,17 +40,7 @@ def export_drn(lp: StabilizationLP, path: str | os.PathLike[str]) -> None:
     BadInput
         Gamma is not 1, C is empty, no cell of C has m > 0, or the file cannot be written.
     """
-    inputs.kind(lp, StabilizationLP, "lp", "a compiled LP; see lmdsl.compile")
-    if lp.gamma != 1:
-        raise BadInput(
-            f"{lp.gamma!r} is not accepted: Storm's expected total cost has no weight, so only a "
-            "problem with gamma = 1 can be exported",
-            "gamma",
-        )
-    if not lp.n:
-        raise BadInput("the stabilizable set is empty; there is no model to export")
-    if not lp.weight.any():
-        raise BadInput("no cell of `measure` is stabilizable; there is no initial state")
+    require_model(lp)
     refuse_own_file(inputs.path(path))
     write_whole(inputs.path(path), _lines(lp))
 
@@ -61,9 +51,7 @@ def write(result: Result, lp: StabilizationLP, path: str) -> None:
 
 
 def _lines(lp: StabilizationLP) -> Iterator[bytes]:
-    last = {lp.n: "attractor"}
-    if lp.rows.shares.ended is not None:
-        last[lp.n + 1] = "ended"
+    last = last_states(lp)
     where = "".join(f"; state {j}: the {name}" for j, name in last.items())
     yield (
         "// written by lmdsl\n"
@@ -76,7 +64,7 @@ def _lines(lp: StabilizationLP) -> Iterator[bytes]:
         text = [f"state {i} [0]{' init' if lp.weight[i] > 0 else ''}\n"]
         for k in range(lp.pair_pointer[i], lp.pair_pointer[i + 1]):
             text.append(f"\taction {lp.control[k]} [{Fraction(float(lp.cost[k]))}]\n")
-            text += [f"\t\t{j} : {share}\n" for j, share in _row(lp, k)]
+            text += [f"\t\t{j} : {share}\n" for j, share in exact_row(lp, k)]
         yield "".join(text).encode()
     for j, name in last.items():
         yield f"state {j} [0] {name}\n\taction stay [0]\n\t\t{j} : 1\n".encode()
@@ -85,13 +73,3 @@ def _lines(lp: StabilizationLP) -> Iterator[bytes]:
 def _assumed(lp: StabilizationLP) -> str:
     assumes = lp.problem.system.assumes
     return f"// assumed: {assumes}\n" if assumes else ""
-
-
-def _row(lp: StabilizationLP, k: int) -> list[tuple[int, Fraction]]:
-    """Return a row as (target, probability), each target once and ascending, as Storm wants it."""
-    row, numerator = lp.rows.exact(k), dict[int, int]()
-    if lp.rows.shares.ended is not None:
-        row[-1] = (lp.n + 1, row[-1][1])  # the last entry
-    for j, count in row:
-        numerator[j] = numerator.get(j, 0) + count
-    return [(j, Fraction(numerator[j], lp.rows.total(k))) for j in sorted(numerator)]

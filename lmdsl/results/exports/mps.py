@@ -7,6 +7,7 @@ import numpy as np
 from lmdsl.common.files import write_whole
 from lmdsl.errors import BadInput
 from lmdsl.model.lp import StabilizationLP
+from lmdsl.results.result import Result
 
 
 def export_mps(lp: StabilizationLP, path: Path) -> None:
@@ -28,3 +29,8 @@ def export_mps(lp: StabilizationLP, path: Path) -> None:
     lines.append("RHS")
     lines += [f" m {names[i]} {float(lp.b[i])!r}" for i in np.flatnonzero(lp.b)]
     write_whole(path, ("\n".join([*lines, "ENDATA"]) + "\n").encode())
+
+
+def write(result: Result, lp: StabilizationLP, path: str) -> None:
+    """Write the LP of a result for ``lmdsl export``."""
+    export_mps(lp, Path(path))

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lmdsl.common import optional
 from lmdsl.common.types import Floats
-from lmdsl.errors import BadInput, MissingDependency
+from lmdsl.errors import BadInput
 from lmdsl.formulas.language import parse
 from lmdsl.systems.base import MapSystem, OdeSystem, System
 from lmdsl.systems.function import FunctionSystem
@@ -49,14 +50,7 @@ def needed(package: str) -> Any:
     MissingDependency
         It is not installed.
     """
-    from importlib import import_module
-
-    try:
-        return import_module(package)
-    except ImportError:
-        raise MissingDependency(
-            f"from_{package} needs the package {package}; pip install 'lmdsl[{package}]'"
-        ) from None
+    return optional.needed(package, f"from_{package}", package)
 
 
 def system_of(
