@@ -12,6 +12,7 @@ from lmdsl.machine import forking as forking
 
 if TYPE_CHECKING:
     from lmdsl import backends as backends
+    from lmdsl import interop as interop
     from lmdsl import plotting as plotting
     from lmdsl import systems as systems
     from lmdsl import testing as testing
@@ -85,7 +86,7 @@ _HOME = {
     "study": "advice.studies.running",
     "verify": "results.verification",
 }
-_PACKAGES = {name: name for name in ("backends", "plotting", "systems", "testing")}
+_PACKAGES = {name: name for name in ("backends", "interop", "plotting", "systems", "testing")}
 _PACKAGES["exports"] = "results.exports"
 
 __all__ = ["__version__", *_HOME, *_PACKAGES]

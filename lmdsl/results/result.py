@@ -25,7 +25,7 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.results.status import Cause, Status
-from lmdsl.results.summary import CostFrom, Coverage, Paged, Summary
+from lmdsl.results.summary import Carried, CostFrom, Coverage, Paged, Summary
 from lmdsl.systems import MatrixSystem
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
-class Result(Paged, Summary, InUse):
+class Result(Paged, Carried, Summary, InUse):
     """The answer to a problem; see :class:`Summary` for the scalars.
 
     Attributes

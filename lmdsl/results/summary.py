@@ -1,6 +1,7 @@
 """The scalar part of a result."""
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Self, cast
 
@@ -260,3 +261,37 @@ class Paged:
 
         write(cast(Any, self), path, proof=proof, comparison=comparison, seed=seed,
               progress=progress)  # fmt: skip
+
+
+class Carried:
+    """What takes a result to other packages; each is imported when it is asked for."""
+
+    def to_xarray(self, units: Mapping[str, str] | None = None) -> Any:
+        """Return an ``xarray.Dataset`` with axes as coordinates; needs the package xarray.
+
+        Parameters
+        ----------
+        units
+            Units by name of axes and controls, kept as attributes.
+
+        Notes
+        -----
+        Its variables, over all cells: the controls at the centres by name, NaN where there is
+        none; ``control_index``, ``value``, ``lower``, ``measure``, ``weight``, ``cell_status``.
+        Where an axis or a control has such a name, ours has a line behind it. The numbers of the
+        report, the digest of the model and the problem file are attributes. NetCDF and Zarr keep
+        all of it.
+        """
+        from lmdsl.interop.arrays import to_xarray
+
+        return to_xarray(self, units)
+
+    def to_dataframe(self) -> Any:
+        """Return a ``pandas.DataFrame`` with a row for each cell; needs the package pandas.
+
+        The columns are ``cell``, the axes (centres), ``status``, ``control_index``, the controls
+        at the centres, ``value``, ``lower`` and ``measure``.
+        """
+        from lmdsl.interop.arrays import to_dataframe
+
+        return to_dataframe(self)

@@ -22,18 +22,21 @@ PACKAGE = Path(lm.__file__).parent
 PACKAGES = [
     "errors", "machine", "common", "formulas", "systems", "problem", "model", "certificate",
     "optimize", "backends", "data", "proof", "control", "results", "explanation", "advice",
-    "plotting", "report", "testing", "cli", "__main__",
+    "plotting", "report", "interop", "testing", "cli", "__main__",
 ]  # fmt: skip
 
 # Imports against the order, inside functions: methods that only forward to a later package.
-FORWARDING = {("model.lp", "results.exports.mps"), ("results.summary", "report.writing")}
+FORWARDING = {
+    ("model.lp", "results.exports.mps"), ("results.summary", "report.writing"),
+    ("results.summary", "interop.arrays"),
+}  # fmt: skip
 
 PUBLIC = [
     "Area", "BadInput", "CellStatus", "Certificate", "CheckReport", "Comparison", "Controller",
     "Explanation", "Finding", "GammaBar", "LmdslError", "PhaseOne", "Problem", "Region", "Result",
     "Simulation", "StabilizationLP", "Study", "TimeLimitReached", "Verification", "__version__",
     "backends", "check", "compare", "compile", "explain", "exports", "from_data",
-    "from_matrices", "gamma_max", "load", "plotting", "read_data", "solve", "study", "systems",
+    "from_matrices", "gamma_max", "interop", "load", "plotting", "read_data", "solve", "study", "systems",
     "testing", "verify",
 ]  # fmt: skip
 
