@@ -1,6 +1,7 @@
 """The feedback controller, and closed-loop simulation of the true map."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -8,10 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
 from lmdsl.common.types import Floats, Indices
+from lmdsl.control.interpolated import Interpolated
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
+
+Law = Literal["constant", "interpolated"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +41,7 @@ class Controller(Frozen):
     local: LocalController | None = None
 
     @own_arithmetic
-    def __call__(self, x: ArrayLike) -> Floats:
+    def __call__(self, x: ArrayLike, mode: Law = "constant") -> Floats:
         """Return the control at states.
 
         Parameters
@@ -46,6 +50,10 @@ class Controller(Frozen):
             Shape (..., d), in the order of the axes; or by name, in any order: a mapping from axes
             to arrays, a table with these columns. Periodic axes wrap; under ``on_exit: clip`` a
             state outside the box has the control of the nearest one inside.
+        mode
+            ``constant`` on cells, as certified; or ``interpolated`` between the centres of cells
+            of one branch, see :mod:`lmdsl.control.interpolated`: the certificate does not speak
+            of that.
 
         Returns
         -------
@@ -55,7 +63,18 @@ class Controller(Frozen):
         """
         states = inputs.states(x, self.partition.names)
         flat, cell = self.partition.enter(states.reshape(-1, self.partition.dimension))
-        return self.at(cell, flat).reshape(*states.shape[:-1], self.vectors.shape[1])
+        return self.law(mode).at(cell, flat).reshape(*states.shape[:-1], self.vectors.shape[1])
+
+    def law(self, mode: Law) -> "Controller | Interpolated":
+        """Return the controller, or what interpolates it."""
+        if mode not in ("constant", "interpolated"):
+            fix = 'write "constant" or "interpolated"'
+            raise BadInput(f"{shown(mode)} is not accepted; {fix}", "mode")
+        if mode == "constant":
+            return self
+        if self.partition.numbered:
+            raise BadInput("a finite model has no states between its cells", "mode")
+        return Interpolated(self)
 
     def at(self, cell: Indices, x: Floats | None = None) -> Floats:
         """Return the control of cells, shape (r, p); NaN for -1 and without control.
