@@ -310,7 +310,11 @@ def test_arguments_of_another_kind_are_named(bad, tmp_path):
         plots.causes, plots.control, plots.measure, plots.trajectories, plots.figure,
         lambda x: lm.exports.export_certificate(x, tmp_path / "c"), lm.backends.missing,
         lambda x: lm.exports.export_drn(x, tmp_path / "d"), lm.testing.check_backend,
-        lm.backends.resolve,
+        lm.backends.resolve, lm.interop.policy,
+        lambda x: lm.exports.export_c(x, tmp_path / "h"),
+        lambda x: lm.exports.export_csv(x, tmp_path / "t"),
+        lambda x: lm.exports.export_onnx(x, tmp_path / "o"),
+        lambda x: lm.exports.export_umb(x, tmp_path / "u"),
     ):  # fmt: skip
         refused(lambda call=call: call(bad))
 
@@ -324,6 +328,9 @@ def test_paths_of_another_kind_are_named(bad, tmp_path, monkeypatch):
         RESULT.save, lm.Result.load, lm.verify, lm.load, RESULT.problem.save, RESULT.lp.write_mps,
         lambda path: lm.exports.export_certificate(RESULT, path),
         lambda path: lm.exports.export_drn(RESULT.lp, path),
+        lambda path: lm.exports.export_umb(RESULT.lp, path),
+        lambda path: lm.exports.export_c(RESULT, path),
+        lambda path: lm.exports.export_csv(RESULT, path),
         lambda path: lm.plotting.figure(PLANE, path) if path is not None else lm.load(path),
     ):  # fmt: skip
         refused(lambda call=call: call(bad), "path")
