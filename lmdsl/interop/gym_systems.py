@@ -5,15 +5,20 @@ from typing import Any
 
 import numpy as np
 
+from lmdsl.common import inputs
 from lmdsl.common.optional import needed
 from lmdsl.errors import BadInput, shown
 from lmdsl.systems.function import FunctionSystem
 
 
 def from_gym(
-    env: Any, states: Sequence[str], controls: Sequence[str] = (), attribute: str = "state"
+    env: Any,
+    states: Sequence[str],
+    controls: Sequence[str] = (),
+    repeat: int = 1,
+    attribute: str = "state",
 ) -> FunctionSystem:
-    """Return a Gymnasium environment as a system: a step of it is a step of the system.
+    """Return a Gymnasium environment as a system: steps of it are a step of the system.
 
     Parameters
     ----------
@@ -25,6 +30,9 @@ def from_gym(
     controls
         Names of the parts of an action, in order: one for a discrete action, whose values are
         those of the action space.
+    repeat
+        Steps of the environment, under one action, that are a step of the system: so many that
+        states move on by a cell or more.
     attribute
         The attribute of the environment that holds the state and can be set.
 
@@ -61,36 +69,40 @@ def from_gym(
     if len(actions) != count:
         given = ", ".join(actions) or "none"
         raise BadInput(f"an action has {count} parts, the names are {given}", "controls")
-    return FunctionSystem(next=GymStep(own, names, actions, attribute, discrete), vectorized=False)
+    times = inputs.whole(repeat, "repeat")
+    step = GymStep(own, names, actions, attribute, times)
+    return FunctionSystem(next=step, vectorized=False)
 
 
 class GymStep:
-    """One step of an environment from a state that is set."""
+    """Steps of an environment from a state that is set, under one action."""
 
     def __init__(
         self, env: Any, states: tuple[str, ...], controls: tuple[str, ...], attribute: str,
-        discrete: bool,
+        repeat: int,
     ) -> None:  # fmt: skip
         self.env, self.states, self.controls = env, states, controls
-        self.attribute, self.discrete = attribute, discrete
+        self.attribute, self.repeat = attribute, repeat
         held = getattr(env, attribute)
         self.shape = np.shape(held)
         self.as_array = isinstance(held, np.ndarray)
 
     def __call__(self, **values: float) -> dict[str, float]:
-        """Return the state after a step."""
+        """Return the state after the steps."""
         start = np.array([values[name] for name in self.states])
         setattr(self.env, self.attribute, start.reshape(self.shape) if self.as_array
                 else tuple(start.tolist()))  # fmt: skip
-        if hasattr(self.env, "steps_beyond_terminated"):  # the cart-pole counts, and complains
-            self.env.steps_beyond_terminated = None
-        self.env.step(self._action(values))
+        action = self._action(values)
+        for _ in range(self.repeat):
+            if hasattr(self.env, "steps_beyond_terminated"):  # the cart-pole counts, and complains
+                self.env.steps_beyond_terminated = None
+            self.env.step(action)
         after = np.ravel(getattr(self.env, self.attribute))
         return dict(zip(self.states, map(float, after), strict=True))
 
     def _action(self, values: dict[str, float]) -> Any:
         space, u = self.env.action_space, [values[name] for name in self.controls]
-        if not self.discrete:
+        if not hasattr(space, "n"):
             return np.array(u, dtype=space.dtype).reshape(space.shape)
         action = int(u[0])
         if action != u[0] or not space.contains(action):
