@@ -145,6 +145,33 @@ def test_the_environments_own_steps_are_the_system():
         assert found["theta"] == pytest.approx(th + omega * 0.05, rel=1e-6)
 
 
+def test_the_pendulum_swings_up_in_their_own_environment():
+    env = gymnasium.make("Pendulum-v1")
+    around = {"low": -np.pi, "high": np.pi, "cells": 24, "periodic": True}
+    problem = lm.Problem(
+        system=lm.interop.from_gym(env, ["theta", "omega"], "torque", repeat=2),
+        state_box={"theta": around, "omega": {"low": -8, "high": 8, "cells": 24}},
+        attractor={"boxes": [{"theta": [-np.pi / 12, np.pi / 12], "omega": [-4 / 3, 4 / 3]}]},
+        control_grid={"torque": {"low": -2, "high": 2, "points": 3}},
+        stage_cost="1",
+        sampling={"kind": "grid", "per_axis": 2},
+        on_exit="clip",
+    )
+    result, own = lm.solve(problem), gymnasium.make("Pendulum-v1")
+    assert result.status == "verified"
+    for seed in range(10):
+        own.reset(seed=seed)
+        for _ in range(100):
+            u = result.controller(own.unwrapped.state)
+            if np.isnan(u).any():
+                break
+            own.step(u)
+            own.step(u)
+        theta, omega = own.unwrapped.state
+        assert np.cos(theta) >= np.cos(np.pi / 12) - 1e-9
+        assert abs(omega) <= 4 / 3 + 1e-9
+
+
 def test_the_car_on_the_mountain():
     env = gymnasium.make("MountainCar-v0")
     system = lm.interop.from_gym(env, ["position", "velocity"], "push")
