@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lmdsl.common import inputs
 from lmdsl.common.optional import needed
@@ -59,13 +60,16 @@ def control_system(problem: Problem, *, sampled: bool = False) -> Any:
     )
 
 
-def controller_system(result: Result) -> Any:
+def controller_system(result: Result, otherwise: ArrayLike | None = None) -> Any:
     """Return the controller as a NonlinearIOSystem without states: from states to controls.
 
     Parameters
     ----------
     result
-        An answer with a controller. Where it says nothing, outputs are NaN.
+        An answer with a controller.
+    otherwise
+        The control where it says nothing, shape (p,); by default NaN, which python-control takes
+        for an algebraic loop where systems are joined.
 
     Returns
     -------
@@ -74,10 +78,20 @@ def controller_system(result: Result) -> Any:
     """
     control = needed("control", "controller_system", "control")
     _require_controller(result)
-    problem = result.problem
+    problem, fill = result.problem, np.full(len(result.problem.controls), np.nan)
+    if otherwise is not None:
+        fill = inputs.real(otherwise, "otherwise").reshape(-1)
+        if len(fill) != len(problem.controls):
+            wanted = f"({len(problem.controls)},)"
+            raise BadInput(f"a control has shape {wanted}, not {fill.shape}", "otherwise")
+
+    def law(t: float, x: Floats, u: Floats, params: Mapping[str, float]) -> Floats:
+        found = result.controller(np.ravel(u))
+        return np.where(np.isnan(found), fill, found)
+
     return control.nlsys(
         None,
-        lambda t, x, u, params: result.controller(np.ravel(u)),
+        law,
         inputs=list(problem.states),
         outputs=[*problem.controls],
         dt=sampling_time(problem),

@@ -1,9 +1,11 @@
 """What the page on other packages says of the functions."""
 
 import inspect
+import shutil
 
 import pytest
-from pages import ROOT
+from pages import ROOT, blocks
+from problems import made, standard_map
 
 import lmdsl as lm
 
@@ -19,3 +21,22 @@ def test_every_function_is_described_with_its_signature(name):
     assert f"`{name}{wanted}`".replace("'", '"').removeprefix("`") in PAGE.replace("\n", " ")
     for parameter in signature.parameters:
         assert parameter in (inspect.getdoc(function) or "")
+
+
+@pytest.mark.parametrize("package", ["xarray", "gymnasium", "python-control", "onnxruntime"])
+def test_blocks_run_where_their_package_is(package, tmp_path, monkeypatch):
+    """The blocks that the tests of the documentation leave out."""
+    pytest.importorskip(package.removeprefix("python-"))
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    monkeypatch.chdir(tmp_path)
+    result = lm.solve(made(standard_map(12)))
+    if package == "onnxruntime":
+        pytest.importorskip("onnx")
+        lm.exports.export_onnx(result, "controller.onnx")
+    space, ran = {"lm": lm, "result": result}, 0
+    for page in ("interop", "exports"):
+        for block in blocks((ROOT / f"docs/{page}.md").read_text()):
+            if block.before == f"<!-- no-run: needs {package} -->":
+                exec(block.text, space)
+                ran += 1
+    assert ran

@@ -12,10 +12,16 @@ from lmdsl.interop import (
     state_space,
     with_gain,
 )
+from lmdsl.model.grid.partition import Partition
 
 ct = pytest.importorskip("control")
 
-PENDULUM = lm.Problem.model_validate(lm.systems.NAMED["inverted_pendulum"].problem)
+PENDULUM = lm.Problem.model_validate({
+    **lm.systems.NAMED["inverted_pendulum"].problem,
+    "system": {"kind": "inverted_pendulum", "substeps": 4},
+    "state_box": {"theta": {"low": -np.pi, "high": np.pi, "cells": 32, "periodic": True},
+                  "omega": {"low": -9, "high": 9, "cells": 32}},
+})  # fmt: skip
 
 
 def test_the_system_is_the_equation():
@@ -64,7 +70,7 @@ def test_the_closed_loop_is_the_closed_loop():
 
 def test_system_and_controller_joined_are_the_closed_loop():
     result = lm.solve(made(standard_map(20)))
-    system, law = control_system(result.problem), controller_system(result)
+    system, law = control_system(result.problem), controller_system(result, [0.0])
     joined = ct.interconnect(
         [system, law], inplist=[], outlist=["x", "y"], connections=[
             [f"{system.name}.u", f"{law.name}.u"],
@@ -84,6 +90,15 @@ def test_a_sampled_equation_makes_compiled_steps():
     path = result.closed_loop.path(start, 100, as_compiled=True)
     found = ct.input_output_response(loop, np.arange(len(path)) * loop.dt, X0=start)
     np.testing.assert_array_equal(found.states.T[:-1], path[:-1])  # the last ends on its way
+
+
+def test_where_the_controller_says_nothing():
+    result = lm.solve(made(standard_map(20)))
+    attractor = np.array([0.25, 0.5])
+    assert np.isnan(controller_system(result).outfcn(0, None, attractor, {})).all()
+    assert controller_system(result, [0.5]).outfcn(0, None, attractor, {}).tolist() == [0.5]
+    with pytest.raises(lm.BadInput, match=r"otherwise: a control has shape \(1,\)"):
+        controller_system(result, [0.5, 0.0])
 
 
 def test_noise_is_an_input():
@@ -116,7 +131,7 @@ def test_a_linearisation_is_that_of_python_control():
 def test_their_gain_in_our_problem():
     """dlqr's gain as a local controller acts as it is, and is the gain of ours at its weights."""
     rest = [0.0] * len(PENDULUM.states)
-    linear, width = state_space(PENDULUM, rest), lm.compile(PENDULUM).partition.width
+    linear, width = state_space(PENDULUM, rest), Partition.of(PENDULUM).width
     reach = max(abs(u) for u in (PENDULUM.control_grid[PENDULUM.controls[0]].vector()))
     gain, _, poles = ct.dlqr(linear, np.diag(1 / width**2), np.diag([1 / reach**2]))
     assert (np.abs(poles) < 1).all()

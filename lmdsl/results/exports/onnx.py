@@ -77,7 +77,7 @@ class _Graph:
     def constant(self, array: Any, kind: Any = np.float64) -> str:
         """Add a constant."""
         name = f"c{len(self.constants)}"
-        held = np.ascontiguousarray(np.asarray(array, dtype=kind))
+        held = np.array(array, dtype=kind, order="C")
         self.constants.append(self.onnx.numpy_helper.from_array(held, name))
         return name
 
