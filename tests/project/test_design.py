@@ -36,8 +36,8 @@ PUBLIC = [
     "Explanation", "Finding", "GammaBar", "LmdslError", "PhaseOne", "Problem", "Region", "Result",
     "Simulation", "StabilizationLP", "Study", "TimeLimitReached", "Verification", "__version__",
     "backends", "check", "compare", "compile", "explain", "exports", "from_data",
-    "from_matrices", "gamma_max", "interop", "load", "plotting", "read_data", "solve", "study", "systems",
-    "testing", "verify",
+    "from_matrices", "gamma_max", "interop", "load", "plotting", "read_data", "solve", "study",
+    "systems", "testing", "verify",
 ]  # fmt: skip
 
 
