@@ -1,7 +1,7 @@
 """The feedback controller, and closed-loop simulation of the true map."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -9,13 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
 from lmdsl.common.types import Floats, Indices
-from lmdsl.control.interpolated import Interpolated
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.grid.simplices import corners
 from lmdsl.model.local.controller import LocalController
 
 Law = Literal["constant", "interpolated"]
+JUMP = 0.25  # share of a control's range by which it may differ within a branch
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +41,8 @@ class Controller(Frozen):
     index: NDArray[np.int32]
     local: LocalController | None = None
 
+    mode: ClassVar[Law] = "constant"
+
     @own_arithmetic
     def __call__(self, x: ArrayLike, mode: Law = "constant") -> Floats:
         """Return the control at states.
@@ -52,8 +55,8 @@ class Controller(Frozen):
             state outside the box has the control of the nearest one inside.
         mode
             ``constant`` on cells, as certified; or ``interpolated`` between the centres of cells
-            of one branch, see :mod:`lmdsl.control.interpolated`: the certificate does not speak
-            of that.
+            of one branch, see :class:`lmdsl.control.controller.Interpolated`: the certificate does
+            not speak of that.
 
         Returns
         -------
@@ -93,4 +96,45 @@ class Controller(Frozen):
                 raise BadInput(f"{len(cell)} cells, but states of shape {np.shape(x)}", "x")
             inside = (cell >= 0) & self.local.attractor[cell]
             u[inside] = self.local(x[inside], cell[inside])
+        return u
+
+
+class Interpolated:
+    """The controller made continuous within branches: barycentric between the centres of cells.
+
+    Centres of another branch than the cell of the state, or without control, are left out; the
+    weights of the rest are scaled to sum 1. Two cells are of one branch where no control differs by
+    more than JUMP of its range. It is asked as the controller is; the local feedback stays.
+    """
+
+    mode: Law = "interpolated"
+
+    def __init__(self, controller: Controller) -> None:
+        self.controller, self.partition = controller, controller.partition
+        self.vectors, self.index = controller.vectors, controller.index
+        self.local = controller.local
+        self.low, self.high = self.vectors.min(axis=0), self.vectors.max(axis=0)
+
+    def at(self, cell: Indices, x: Floats | None = None) -> Floats:
+        """Return the control at states x, shape (r, d), of given cells, shape (r, p)."""
+        u = self.controller.at(cell, x)
+        if x is None:
+            return u
+        cell = np.atleast_1d(cell)
+        on = np.flatnonzero((cell >= 0) & (self.index[cell] >= 0))
+        u[on] = self._between(np.asarray(x)[on], u[on])
+        return u
+
+    def _between(self, x: Floats, own: Floats) -> Floats:
+        """Return the control at states whose own cells have one, shape (r, p)."""
+        moved, total = np.zeros_like(own), np.zeros(len(x))
+        for cells, weight in corners(self.partition, x):
+            index = self.index[cells]
+            away = self.vectors[index] - own
+            near = (np.abs(away) <= JUMP * (self.high - self.low)).all(axis=1)
+            kept = np.where((index >= 0) & near, weight, 0.0)
+            moved += kept[:, None] * away
+            total += kept
+        moved /= np.where(total > 0, total, 1.0)[:, None]
+        u: Floats = np.clip(own + moved, self.low, self.high)
         return u
