@@ -220,7 +220,7 @@ def test_all_is_what_people_use():
     extras = project["optional-dependencies"]
     (listed,) = extras["all"]
     found = re.fullmatch(r"lmdsl\[(.*)\]", listed)[1].split(",")
-    ours = {"all", "bench", "docs", "lint", "notebooks", "peers", "test"}
+    ours = {"all", "bench", "docs", "lint", "notebooks", "peers", "readers", "test"}
     assert sorted(found) == sorted({*extras} - ours)
 
 
