@@ -17,6 +17,8 @@ Run = Callable[[Arguments], int]
 # Adds a command: its name, what runs it, its help.
 Command = Callable[[str, Run, str], argparse.ArgumentParser]
 
+AS_STORED = "the result as stored, not re-checked; see lmdsl verify"
+
 SHARED: dict[str, dict[str, Any]] = {
     "file": {"metavar": "FILE", "help": "problem file, or a result directory: its problem"},
     "dir": {"metavar": "DIR", "help": "result directory"},

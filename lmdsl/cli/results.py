@@ -2,15 +2,13 @@
 
 import sys
 from importlib import import_module
-from pathlib import Path
 
-from lmdsl.cli.output import Arguments, Command, ProgressLine, answer, print_json, shared
+from lmdsl.cli import plotting
+from lmdsl.cli.output import AS_STORED, Arguments, Command, ProgressLine, answer, print_json, shared
 from lmdsl.cli.streams import say
 from lmdsl.cli.values import parameters, states
 from lmdsl.errors import printable
 from lmdsl.results.formats import FORMATS
-
-AS_STORED = "the result as stored, not re-checked; see lmdsl verify"
 
 
 def add(command: Command) -> None:
@@ -44,9 +42,9 @@ def add(command: Command) -> None:
                        help="bound what any control law costs, too")  # fmt: skip
     shared(prove, "--time-limit", "--json")
 
-    plot = command("plot", _plot, "Draw the figures of a saved result.")
+    plot = command("plot", plotting.run, "Draw the figures of a saved result.")
     shared(plot, "dir")
-    plot.add_argument("--out", metavar="FILE", help="PNG, PDF or SVG (default DIR/figures.png)")
+    plotting.add(plot)
 
     _add_report(command)
     export = command("export", _export, "Write a saved result in a format for other readers.")
@@ -111,19 +109,6 @@ def _prove(parsed: Arguments) -> int:
     proved.add(parsed.dir, result, proof)
     answer(parsed, proof)
     return 0 if proof.reached else 1
-
-
-def _plot(parsed: Arguments) -> int:
-    from lmdsl import plotting
-    from lmdsl.results.directory import archive, proved
-
-    stored = archive.read(parsed.dir)
-    result = stored.result
-    proof = proved.as_stored(parsed.dir, result, stored.certificate.proof)
-    path = Path(parsed.out) if parsed.out is not None else Path(parsed.dir) / "figures.png"
-    plotting.figure(result, path, proof=proof)
-    say(f"written to {printable(str(path))} ({AS_STORED})")
-    return 0
 
 
 def _report(parsed: Arguments) -> int:

@@ -1,13 +1,14 @@
 """Pictures of a problem and its result; matplotlib is imported when something is drawn."""
 
-from lmdsl.plotting.brackets import bracket
-from lmdsl.plotting.closed_loop import trajectories
-from lmdsl.plotting.page import figure
-from lmdsl.plotting.plots import causes, control, cost, measure, portrait
-from lmdsl.plotting.proofs import proof
-from lmdsl.plotting.studies import study
+from lmdsl.plotting.motion import portrait, trajectories
+from lmdsl.plotting.pages.page import figure
+from lmdsl.plotting.pages.panels import projections, slices
+from lmdsl.plotting.pages.studies import study
+from lmdsl.plotting.plots import causes, control, cost, coverage, measure
+from lmdsl.plotting.proved.brackets import bracket
+from lmdsl.plotting.proved.proofs import proof
 
 __all__ = [
-    "bracket", "causes", "control", "cost", "figure", "measure", "portrait", "proof",
-    "study", "trajectories",
+    "bracket", "causes", "control", "cost", "coverage", "figure", "measure", "portrait",
+    "projections", "proof", "slices", "study", "trajectories",
 ]  # fmt: skip

@@ -2,8 +2,8 @@
 
 import unicodedata
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Self
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,13 @@ from lmdsl.common import inputs
 from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.errors import BadInput, shown
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.stabilizable_set import CellStatus
 
 At = Mapping[str, float]
+UNSOLVED = 7  # code of a cell that is stabilizable, without a controller
+
+# Of what lies over a cell that is shown: the value that is worst, or the mean.
+Projection = Literal["worst", "mean"]
 
 
 def plain(text: str, limit: int = 60) -> str:
@@ -32,11 +37,13 @@ def number(value: float, digits: int = 3) -> str:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One or two axes of the partition, the others held at one cell."""
+    """One or two axes of the partition, the others held at one cell or projected away."""
 
     partition: Partition  # all cells
     axes: tuple[int, ...]  # positions of the axes shown
     cell: Indices  # multi-index of a cell in the slice, shape (d,)
+    away: tuple[int, ...] = ()  # positions of the axes projected away
+    project: Projection = "worst"  # and how
 
     @classmethod
     def of(
@@ -45,10 +52,12 @@ class View:
         attractor: Bools,
         axes: Sequence[str] | None = None,
         at: Mapping[str, float] | None = None,
+        project: Projection | None = None,
     ) -> Self:
         """Resolve a choice of axes; the default slice passes through the attractor's centre.
 
-        Without an attractor it passes through the middle of the box.
+        Without an attractor it passes through the middle of the box. With ``project`` the axes
+        neither shown nor held are projected away.
         """
         names, at = partition.names, {} if at is None else at
         inputs.kind(at, Mapping, "at", "a mapping; write {axis: value}")
@@ -64,32 +73,61 @@ class View:
             raise BadInput(f"{shown(list(chosen))}: choose one or two different axes", "axes")
         if set(at) & set(chosen):
             raise BadInput(f"{shown(list(at))}: only axes that are not shown are held", "at")
-        cells = np.flatnonzero(attractor)
-        if not len(cells):
-            cells = np.ravel_multi_index([[k // 2] for k in partition.shape], partition.shape)
-        centres = partition.centres(cells)
-        distance = np.abs((centres - centres.mean(axis=0)) / partition.width).sum(axis=1)
-        point = centres[np.argmin(distance)].copy()
+        if project is not None and project not in get_args(Projection):
+            raise BadInput(f"{shown(project)}: write worst or mean", "project")
+        point = _centre(partition, attractor)
         for name, value in at.items():
-            point[names.index(name)] = inputs.states({name: value}, [name], "at")[..., 0]
+            place = inputs.states({name: value}, [name], "at")[..., 0]
+            if place.shape:
+                raise BadInput(f"{shown(value)}: {name} is held at one place", "at")
+            point[names.index(name)] = place
         inside = partition.locate([np.array([x]) for x in point], clip=False)
         if inside[0] < 0:
             raise BadInput(f"{shown(dict(at))} lies outside the state box", "at")
         cell = np.array(partition.multi_index(inside))[:, 0]
-        return cls(partition, tuple(names.index(name) for name in chosen), cell)
+        away = [k for k, name in enumerate(names) if name not in (*chosen, *at)]
+        return cls(
+            partition,
+            tuple(names.index(name) for name in chosen),
+            cell,
+            tuple(away) if project else (),
+            project or "worst",
+        )
+
+    def moved(self, at: Mapping[int, int]) -> Self:
+        """Return the slice through other cells of some axes: their index by position."""
+        cell = self.cell.copy()
+        for k, index in at.items():
+            cell[k] = index
+        return replace(self, cell=cell)
 
     @property
     def hidden(self) -> tuple[int, ...]:
-        """Positions of the axes not shown."""
-        return tuple(k for k in range(self.partition.dimension) if k not in self.axes)
+        """Positions of the axes that are held."""
+        seen = self.axes + self.away
+        return tuple(k for k in range(self.partition.dimension) if k not in seen)
 
     @property
-    def note(self) -> str:
-        """Where the slice is, such as " (z ≈ 25.5)"; empty when every axis is shown."""
+    def whole(self) -> bool:
+        """Whether every axis is shown."""
+        return len(self.axes) == self.partition.dimension
+
+    @property
+    def held(self) -> str:
+        """Where the slice is, such as "z ≈ 25.5"; empty where no axis is held."""
         p = self.partition
         at = p.low + (self.cell + 0.5) * p.width
         held = [f"{plain(p.names[k], 16)} ≈ {number(at[k])}" for k in self.hidden]
-        return f" ({', '.join(held[:4])}{', …' if len(held) > 4 else ''})" if held else ""
+        return ", ".join(held[:4]) + ", …" * (len(held) > 4)
+
+    @property
+    def note(self) -> str:
+        """Where the slice is, and what is projected away, in brackets; or empty."""
+        p, parts = self.partition, [self.held] * bool(self.hidden)
+        if self.away:
+            names = [plain(p.names[k], 16) for k in self.away]
+            parts.append(f"{self.project} over {', '.join(names[:4])}{', …' * (len(names) > 4)}")
+        return f" ({'; '.join(parts)})" if parts else ""
 
     def label(self, k: int) -> str:
         """Return the label of the k-th axis shown."""
@@ -106,16 +144,78 @@ class View:
         p, i = self.partition, self.axes[k]
         return float(p.low[i]), float(p.high[i])
 
-    def slice(self, flat: NDArray[Any]) -> NDArray[Any]:
-        """Return values over the cells shown, indexed in the order of the axes shown."""
-        grid = flat.reshape(self.partition.shape).transpose(self.axes + self.hidden)
-        return grid[(..., *self.cell[list(self.hidden)])]
+    def over(self, flat: NDArray[Any]) -> NDArray[Any]:
+        """Return values over the cells shown, and last all that lie over each: (..., R).
+
+        Of a slice R is 1.
+        """
+        grid = flat.reshape(self.partition.shape).transpose(self.axes + self.away + self.hidden)
+        cut = grid[(..., *self.cell[list(self.hidden)])]
+        return cut.reshape(*cut.shape[: len(self.axes)], -1)
+
+    def values(self, flat: Floats, signed: bool = False) -> Floats:
+        """Return one value a cell shown, of those that are no NaN; NaN where there is none.
+
+        The worst is the largest, of ``signed`` ones the largest in magnitude.
+        """
+        each = self.over(flat)
+        if not self.away:
+            return np.asarray(each[..., 0])
+        known = ~np.isnan(each)
+        count = known.sum(axis=-1)
+        if self.project == "mean":
+            total = np.where(known, each, 0.0).sum(axis=-1)
+            return np.asarray(total / np.where(count > 0, count, np.nan))
+        size = np.where(known, np.abs(each) if signed else each, -np.inf)
+        worst = np.take_along_axis(each, size.argmax(axis=-1)[..., None], axis=-1)[..., 0]
+        return np.where(count > 0, worst, np.nan)
+
+    def codes(self, flat: NDArray[np.integer]) -> NDArray[np.integer]:
+        """Return the region of every cell shown.
+
+        Of several cells STABILIZED where one is, AVOID where all are; else the commonest of others.
+        """
+        each = self.over(flat)
+        if not self.away:
+            return np.asarray(each[..., 0])
+        found = np.full(each.shape[:-1], CellStatus.AVOID, dtype=each.dtype)
+        most = np.zeros(each.shape[:-1], dtype=np.int64)
+        for code in np.setdiff1d(each, [CellStatus.AVOID]):
+            count = (each == code).sum(axis=-1)
+            if code in (CellStatus.STABILIZED, UNSOLVED):
+                count[count > 0] = each.shape[-1]
+            found[count > most] = code
+            most = np.maximum(most, count)
+        return found
+
+    def some(self, mask: Bools) -> Bools:
+        """Return where any cell that lies over the one shown is marked; of a slice, where it is."""
+        covered: Bools = np.asarray(self.over(mask).any(axis=-1))
+        return covered
 
     def shadow(self, mask: Bools) -> Bools:
-        """Return where any cell over the axes not shown is marked."""
-        grid = mask.reshape(self.partition.shape).transpose(self.axes + self.hidden)
-        covered: Bools = np.asarray(grid.any(axis=tuple(range(len(self.axes), grid.ndim))))
-        return covered
+        """Return where any cell over the axes not shown is marked, held or not."""
+        return self._all().some(mask)
+
+    def core(self, mask: Bools) -> Bools:
+        """Return where every cell over the axes not shown is marked."""
+        return ~self._all().some(~mask)
+
+    def _all(self) -> Self:
+        """Return the view with all axes that are not shown projected away."""
+        away = tuple(k for k in range(self.partition.dimension) if k not in self.axes)
+        return replace(self, away=away)
+
+
+def _centre(partition: Partition, attractor: Bools) -> Floats:
+    """Return the centre of the attractor cell that is nearest to the middle of all of them."""
+    cells = np.flatnonzero(attractor)
+    if not len(cells):
+        cells = np.ravel_multi_index([[k // 2] for k in partition.shape], partition.shape)
+    centres = partition.centres(cells)
+    distance = np.abs((centres - centres.mean(axis=0)) / partition.width).sum(axis=1)
+    point: Floats = centres[np.argmin(distance)].copy()
+    return point
 
 
 def rectangles(mask: Bools, x: Floats, y: Floats) -> Floats:

@@ -49,6 +49,34 @@ def lorenz():
     }
 
 
+def cart(**more):
+    """A pole on a cart in four dimensions, among walls of which one ends below an angle."""
+    ranges = {"x": (-1.2, 1.2, 9), "theta": (-0.5, 0.5, 7), "v": (-2, 2, 6), "omega": (-2, 2, 7)}
+    near = {"x": [-0.5, 0.5], "theta": [-0.25, 0.25], "v": [-1.5, 1.5], "omega": [-0.9, 0.9]}
+    return {
+        "format": "lmdsl/1",
+        "name": "cart",
+        "system": {
+            "kind": "ode",
+            "derivative": {
+                "x": "v",
+                "theta": "omega",
+                "v": "u",
+                "omega": "9.8*sin(theta) - u*cos(theta)",
+            },
+            "step": 0.15,
+            "substeps": 1,
+        },
+        "state_box": {k: {"low": a, "high": b, "cells": n} for k, (a, b, n) in ranges.items()},
+        "attractor": {"boxes": [near]},
+        "avoid": {"boxes": [{"x": [0.7, 0.8], "theta": [0.2, 0.5]}, {"x": [-1.2, -1.0]}]},
+        "control_grid": {"u": {"low": -12, "high": 12, "points": 5}},
+        "stage_cost": "0.1 + x**2 + theta**2",
+        "sampling": {"kind": "grid", "per_axis": 1},
+        **more,
+    }
+
+
 def logistic():
     return {
         "format": "lmdsl/1",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from pictures import logistic, lorenz, maze
+from pictures import cart, logistic, lorenz, maze
 from problems import doubling, made, standard_map
 
 import lmdsl as lm
@@ -15,6 +15,7 @@ def solved():
     known = {
         "maze": maze,
         "lorenz": lorenz,
+        "cart": cart,
         "logistic": logistic,
         "standard": lambda: standard_map(20),
         "refused": lambda: standard_map(20, gamma=50.0),

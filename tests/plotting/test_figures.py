@@ -17,7 +17,7 @@ import lmdsl as lm
 from lmdsl import plotting
 from lmdsl.errors import MissingDependency
 from lmdsl.machine import memory
-from lmdsl.plotting import layers
+from lmdsl.plotting import layers, regions
 from lmdsl.plotting.view import View, number, plain
 
 pytest.importorskip("matplotlib")
@@ -151,8 +151,8 @@ def test_a_million_cells_are_drawn_in_bounded_work():
     noise = np.random.default_rng(0).random(partition.size)
     view = View.of(partition, np.arange(partition.size) == 1234)
     ax = layers.frame(None, view, "")
-    layers.scalar(ax, view, view.slice(noise), "V", "viridis")
-    layers.regions(ax, view, view.slice((noise < 0.5) * 1 + 1), legend=True)
+    layers.scalar(ax, view, view.values(noise), "V", "viridis")
+    regions.regions(ax, view, (noise < 0.5) * 1 + 1, legend=True)
     ax.get_figure().canvas.draw()
     assert len(ax.images) == 2  # too many runs for outlines: regions become images
     assert [t.get_text() for t in ax.get_legend().get_texts()] == ["escapes"]

@@ -10,8 +10,8 @@ from proved_points import box_at
 import lmdsl as lm
 from lmdsl import plotting
 from lmdsl.cli import main
-from lmdsl.plotting import proofs
-from lmdsl.plotting.plots import _view
+from lmdsl.plotting.proved import proofs
+from lmdsl.plotting.quantities import view_of
 from lmdsl.results.directory import proved
 
 pytest.importorskip("matplotlib")
@@ -42,7 +42,7 @@ def drawn(request):
 
 def test_pixels_are_of_the_box_in_which_their_middle_lies(drawn):
     result, proof = drawn
-    view = _view(result, ["y", "x"] if result.partition.dimension > 1 else None, None)
+    view = view_of(result, ["y", "x"] if result.partition.dimension > 1 else None, None)
     pixels = proofs.painted(view, proof)
     rng = np.random.default_rng(0)
     part, seen = result.partition, set()
@@ -69,7 +69,7 @@ def test_a_proof_is_drawn_with_words(drawn):
 def test_boxes_smaller_than_a_pixel_are_seen(drawn, monkeypatch):
     result, proof = drawn
     monkeypatch.setattr(proofs, "PIXELS", 4)
-    pixels = proofs.painted(_view(result, None, None), proof)
+    pixels = proofs.painted(view_of(result, None, None), proof)
     assert pixels.shape[0] == 4
     assert (pixels[3] == proofs.LOST).any()  # the strip in [0.53, 0.57]
     assert not (pixels[0] == proofs.LOST).any()

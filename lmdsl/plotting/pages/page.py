@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import textwrap
-import warnings
 from collections.abc import Sequence
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 from lmdsl.common import inputs
-from lmdsl.common.files import write_whole
-from lmdsl.errors import BadInput, shown
+from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.plotting import layers, overlays, proofs
-from lmdsl.plotting.closed_loop import trajectories
-from lmdsl.plotting.plots import _bytes, _view, control, cost, measure, portrait
-from lmdsl.plotting.view import At, number, plain
+from lmdsl.plotting import layers, overlays
+from lmdsl.plotting.motion import portrait, trajectories
+from lmdsl.plotting.pages import writing
+from lmdsl.plotting.plots import control, cost, measure
+from lmdsl.plotting.proved import proofs
+from lmdsl.plotting.quantities import bytes_of, view_of
+from lmdsl.plotting.view import At, Projection, number, plain
 from lmdsl.proof.record import Proof
 from lmdsl.results.result import Result
 
@@ -24,10 +24,6 @@ if TYPE_CHECKING:
     import os
 
     from matplotlib.figure import Figure
-
-PAGE = 2e8  # bytes for a page as pixels, and for matplotlib
-
-FORMATS = ("png", "pdf", "svg")
 
 
 @own_arithmetic
@@ -37,6 +33,7 @@ def figure(
     *,
     axes: Sequence[str] | None = None,
     at: At | None = None,
+    project: Projection | None = None,
     seed: int = 0,
     proof: Proof | None = None,
 ) -> Figure:
@@ -50,6 +47,8 @@ def figure(
         File to write, ending in .png, .pdf or .svg; it appears whole or not at all.
     axes, at
         Which axes are shown and where the others are held.
+    project
+        ``"worst"`` or ``"mean"``: project the axes neither shown nor held; None: hold them all.
     seed
         Seed of the closed-loop runs.
     proof
@@ -65,24 +64,22 @@ def figure(
         The ending is unknown, or the file cannot be written.
     """
     seed = inputs.seed(seed)
-    target = None if path is None else inputs.path(path)
-    kind = "" if target is None else target.suffix[1:].lower()
-    if target is not None and kind not in FORMATS:
-        raise BadInput(f"{shown(str(target), 200)}: a plot ends in .png, .pdf or .svg")
-    view = _view(result, axes, at)
+    target = writing.target(path)
+    view = view_of(result, axes, at, project)
+    cut: Any = {"axes": axes, "at": at, "project": project}
     draw: list[Any] = []
-    if len(view.axes) == 2 or not view.hidden:
+    if len(view.axes) == 2 or view.whole:
         draw.append(lambda ax: portrait(result, ax=ax, axes=axes, at=at))
-    draw.append(lambda ax: cost(result, ax, axes=axes, at=at))
+    draw.append(lambda ax: cost(result, ax, **cut))
     if (result.control_index >= 0).any():
         for name in result.problem.controls[:4]:
-            draw.append(lambda ax, name=name: control(result, name, ax, axes=axes, at=at))
-        draw.append(lambda ax: measure(result, ax, axes=axes, at=at))
+            draw.append(lambda ax, name=name: control(result, name, ax, **cut))
+        draw.append(lambda ax: measure(result, ax, **cut))
         draw.append(lambda ax: trajectories(result, ax, seed=seed, axes=axes, at=at))
     if proof is not None:
         draw.append(lambda ax: proofs.proof(result, proof, ax, axes=axes, at=at))
     draw.append(lambda ax: _numbers(ax, result))
-    memory.require(_bytes(view, 300 + 60 * len(draw)) + PAGE, "plots")
+    memory.require(bytes_of(view, 300 + 60 * len(draw)) + writing.PAGE, "plots")
     columns = min(len(draw), 3)
     rows = -(-len(draw) // columns)
     page: Figure = layers.blank(columns, rows)
@@ -93,13 +90,7 @@ def figure(
         except BadInput as error:  # such as a Python function that a directory does not hold
             overlays.remark(ax, textwrap.fill(plain(error.message, 200), 36))
     page.suptitle(plain(result.problem.name, 100), fontsize=13)
-    if target is not None:
-        content = BytesIO()
-        stamp = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph .* missing from")
-            page.savefig(content, format=kind, dpi=200, metadata=stamp)
-        write_whole(target, content.getvalue())
+    writing.write(page, target)
     return page
 
 

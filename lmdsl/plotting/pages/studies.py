@@ -14,7 +14,7 @@ from lmdsl.common import inputs
 from lmdsl.common.files import write_whole
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.plotting.page import FORMATS
+from lmdsl.plotting.pages.writing import FORMATS
 from lmdsl.plotting.view import number, plain
 
 if TYPE_CHECKING:

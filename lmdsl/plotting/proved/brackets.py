@@ -10,8 +10,8 @@ import numpy as np
 from lmdsl.common import inputs
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.plotting import layers
-from lmdsl.plotting.plots import _codes, _view
+from lmdsl.plotting import layers, regions
+from lmdsl.plotting.quantities import codes_of, view_of
 from lmdsl.plotting.view import At
 from lmdsl.proof.record import Proof
 from lmdsl.results.result import Result
@@ -69,15 +69,15 @@ def bracket(
         raise BadInput(f"{shown(side)} is unknown; known: {', '.join(WORDS)}", "side")
     if proof.maps is None:
         raise BadInput("it has no bracket; prove with bracket=True", "proof")
-    view = _view(result, axes, at)
+    view = view_of(result, axes, at)
     if len(proof.maps[0]) != result.partition.size:
         raise BadInput("it is a proof of another result", "proof")
     below, above = proof.maps
     with np.errstate(invalid="ignore", divide="ignore"):
         values = {"below": below, "above": above, "ratio": below / above}[side]
     drawn: Axes = layers.frame(ax, view, WORDS[side] + view.note)
-    shown_ = view.slice(np.where(np.isfinite(values), values, np.nan))
+    shown_ = view.values(np.where(np.isfinite(values), values, np.nan))
     if np.isfinite(shown_).any():
         layers.scalar(drawn, view, shown_, "share" if side == "ratio" else "cost", "viridis")
-    layers.regions(drawn, view, view.slice(_codes(result)), legend)
+    regions.regions(drawn, view, codes_of(result), legend)
     return drawn

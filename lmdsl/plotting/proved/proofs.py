@@ -11,8 +11,8 @@ from lmdsl.common import inputs
 from lmdsl.common.types import Bools, Indices, Statuses
 from lmdsl.errors import BadInput
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.plotting import layers
-from lmdsl.plotting.plots import _codes, _view
+from lmdsl.plotting import layers, regions
+from lmdsl.plotting.quantities import codes_of, view_of
 from lmdsl.plotting.view import At, View
 from lmdsl.proof.record import Proof
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
@@ -72,7 +72,7 @@ def proof(
     from matplotlib.patches import Patch
 
     inputs.kind(proof, Proof, "proof", "what Result.prove returns")
-    view = _view(result, axes, at)
+    view = view_of(result, axes, at)
     if proof.split.shape[1] != result.partition.dimension or (
         len(proof.cell) and proof.cell.max() >= result.partition.size
     ):
@@ -85,7 +85,7 @@ def proof(
     if len(view.axes) == 1:
         drawn.set_ylim(0, 1)
         drawn.set_yticks([])
-    layers.regions(drawn, view, view.slice(_codes(result)), False)
+    regions.regions(drawn, view, codes_of(result), False)
     if legend:
         there = [kind for kind in KINDS if (pixels == kind).any()]
         handles = [Patch(facecolor=KINDS[kind][1], label=KINDS[kind][0]) for kind in there]
