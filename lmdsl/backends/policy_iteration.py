@@ -5,6 +5,7 @@ policy as far as the step was worth. The values fall and the last policy is opti
 and with zeros in the cost; for gamma >= 1 every policy on the way is gamma-stabilizing.
 """
 
+import math
 import time
 from dataclasses import dataclass
 
@@ -34,6 +35,10 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
         limit = options.time_limit
         return limit is not None and time.monotonic() - started > limit
 
+    def changes(count: int) -> None:
+        if options.progress:
+            options.progress("solve", elapsed(count, lp.n))
+
     policy, w, value = options.start, options.proof, options.value
     if policy is None:
         found = first_policy.stabilizing(lp, time_up)
@@ -52,12 +57,23 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
         return Solution(Stop.TIME_LIMIT, "time_limit", policy=policy)
     if value is None:
         return Solution(Stop.FAILED, "some cell costs more than 1e305; divide stage_cost")
-    done = iteration.iterate(lp, policy, value, time_up=time_up, limit=options.max_iterations)
+    done = iteration.iterate(
+        lp, policy, value, time_up=time_up, limit=options.max_iterations, changes=changes
+    )
     stop = Stop.OPTIMAL
     if not done.converged:
         stop = Stop.TIME_LIMIT if time_up() else Stop.ITERATION_LIMIT
     word = stop.name.lower()
     return Iterated(stop, word, done.value, None, done.policy, done.steps, iteration=done)
+
+
+def elapsed(changed: int, n: int) -> float:
+    """Return which part of the time is over once a step has changed so many controls of n.
+
+    So it was on the examples, within a fifth: first and second steps change most controls, the last
+    ones few, and all take about as long.
+    """
+    return float((1 - math.log1p(changed) / math.log1p(max(n, 1))) ** (1 / 3))
 
 
 BACKEND = Backend(

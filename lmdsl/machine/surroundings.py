@@ -2,13 +2,15 @@
 
 import contextlib
 import ctypes
-from collections.abc import Callable
+import inspect
+from collections.abc import Callable, Iterator
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
 from lmdsl.errors import BadInput, LmdslError, shown
+from lmdsl.machine.progress import followed
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -18,17 +20,40 @@ def own_arithmetic(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Run a public function with NumPy's default handling of overflow, underflow and the like.
 
     Under the caller's ``np.errstate(under="raise")`` a correct rounding to zero would be an error.
+    Its argument ``progress`` may be True: then a line on stderr shows it.
     """
+    signature = inspect.signature(function)
+    tells = "progress" in signature.parameters
 
     @wraps(function)
     def run(*args: _P.args, **kwargs: _P.kwargs) -> _R:
-        progress = kwargs.get("progress")
-        if progress is not None and not callable(progress):
-            raise BadInput(f"{shown(progress)} is not a function", "progress")
         with np.errstate(divide="warn", over="warn", under="ignore", invalid="warn"):
-            return function(*args, **kwargs)
+            if not tells:
+                return function(*args, **kwargs)
+            with _told(signature, args, kwargs) as (own, named):
+                return function(*own, **named)
 
     return run
+
+
+@contextlib.contextmanager
+def _told(signature: inspect.Signature, args: Any, kwargs: Any) -> Iterator[tuple[Any, Any]]:
+    """Give the arguments of a call, with somebody to tell its progress where that is asked for."""
+    try:
+        bound = signature.bind(*args, **kwargs)
+    except TypeError:  # the function says so itself
+        yield args, kwargs
+        return
+    progress = bound.arguments.get("progress")
+    if progress is True:
+        with followed() as bound.arguments["progress"]:
+            yield bound.args, bound.kwargs
+        return
+    if progress is False:
+        bound.arguments["progress"] = None
+    elif progress is not None and not callable(progress):
+        raise BadInput(f"{shown(progress)} is not a function, nor True", "progress")
+    yield bound.args, bound.kwargs
 
 
 def restore_rounding(who: str) -> None:

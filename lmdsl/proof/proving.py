@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from lmdsl.common.types import Bools, Floats, Indices, Progress, Statuses
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.progress import Forecast
 from lmdsl.proof.bounds.chance import chances
 from lmdsl.proof.bounds.flights.following import Flights
 from lmdsl.proof.bounds.flights.refining import SLACK as RAISED
@@ -56,6 +57,7 @@ def prove(
     each = node_bytes(partition.dimension, len(images.noise[0]))
     memory.require(3.0 * each * partition.size, "the boxes of the proof")
     whole, left = deadline, deadline.left
+    progress = progress and Forecast(progress, target, left)
     if bracket and left is not None:
         left *= 1.0 - BRACKET
         deadline = Deadline(left)

@@ -75,7 +75,7 @@ def solve(
         An earlier result of the same states and controls, on other cells, with other samples or
         another gamma, say: the search begins at its controller. The answer is the same.
     progress
-        Called with (stage, fraction done, or -1).
+        Called with (stage, fraction done, or -1); True shows it on stderr, with the time left.
 
     Returns
     -------
@@ -172,6 +172,7 @@ def _answer(lp: StabilizationLP, request: _Request, compile_seconds: float | Non
     refused = _not_stabilizable(lp, request.require_all, job.finish)
     if refused:
         return job.refused(*refused)
+    request.tell("solve")
     started = time.perf_counter()
     first = request.first(lp)
     if isinstance(first, first_policy.Refused):
@@ -231,7 +232,6 @@ def _asked(
             value=first.value,
             progress=request.progress,
         )
-        request.tell("solve")
         solution, iteration, job.log = ask(lp, request.backend, options)
     outcome = _polish(lp, solution, iteration, first.policy, request.tolerance, deadline)
     return solution, outcome

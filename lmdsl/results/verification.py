@@ -145,6 +145,8 @@ def verify(
     ]
     lp = whole = recompiled(path, result, progress, deadline)
     in_time()
+    if progress:
+        progress("verify", -1.0)
     if result.problem.functions:
         reasons += function_differences(lp, result)
         notes = function_notes(result) + notes

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from lmdsl.common.types import Floats, Guard
 from lmdsl.machine import threads
+from lmdsl.machine.progress import spoken
 from lmdsl.systems.black_box.audit import Audit
 from lmdsl.systems.black_box.function_map import FunctionMap
 from lmdsl.systems.black_box.scalar_map import ScalarMap
@@ -102,11 +103,3 @@ class Asked:
             return "transitions"
         left = (time.perf_counter() - self._begun) * (1 - done) / done
         return f"transitions, {self._calls:,} calls, about {spoken(left)} left"
-
-
-def spoken(seconds: float) -> str:
-    """Return a time in the words of people."""
-    for unit, size, most in (("s", 1, 90), ("min", 60, 90), ("h", 3600, 48)):
-        if seconds < size * most:
-            return f"{seconds / size:.0f} {unit}"
-    return f"{seconds / 86400:.0f} days"

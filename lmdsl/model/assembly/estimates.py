@@ -1,15 +1,20 @@
 """What compiling and solving take, said before: bytes, and whether it is a moment's work."""
 
+import logging
 import math
+import time
 from typing import NamedTuple
 
 from lmdsl.machine import memory, threads
 from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.progress import spoken
 from lmdsl.model import discretization
 from lmdsl.model.assembly.entries import doubles
 from lmdsl.model.assembly.paths.judging import KEPT
 from lmdsl.model.assembly.sampler import CHUNK, chunk
 from lmdsl.problem.problem import Problem
+
+log = logging.getLogger(__name__)
 
 
 def require_least(problem: Problem) -> None:
@@ -103,6 +108,43 @@ CALL = 2_000  # additions that take as long as NumPy's own work for an operation
 
 ENCLOSED = 50  # operations on doubles that take as long as one on enclosures, some bisected
 SET = 20_000  # additions that take as long as resolving a point or a box of a set, its cells apart
+
+
+LONG = 20.0  # seconds from which it is said beforehand how long compiling and solving take
+TOLD_AFTER = 1.0  # seconds of sampling after which that is known well enough
+SOLVING = 1e-7  # seconds that solving and verifying take for a transition, about
+
+
+class Outlook:
+    """What compiling and solving take, said once, in the first seconds of long work.
+
+    Parameters
+    ----------
+    need
+        Bytes that they take.
+    entries
+        Number of transitions, about.
+    """
+
+    def __init__(self, need: float, entries: float) -> None:
+        self.need, self.entries = need, entries
+        self.begun: tuple[float, float] | None = None
+        self.told = False
+
+    def done(self, fraction: float) -> None:
+        """Note that part of the sampling is done."""
+        now = time.perf_counter()
+        if self.begun is None:  # kernels were compiled on the way here
+            self.begun = now, fraction
+            return
+        began, first = self.begun
+        if self.told or now - began < TOLD_AFTER or fraction <= first:
+            return
+        self.told = True
+        seconds = (now - began) * (1 - first) / (fraction - first) + SOLVING * self.entries
+        if seconds > LONG:
+            what = f"about {spoken(seconds)}, {memory.human(self.need)}"
+            log.info("compiling and solving take %s", what)
 
 
 def work(problem: Problem) -> float:

@@ -20,7 +20,14 @@ from lmdsl.common.types import Floats, Guard, Indices, Progress
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
-from lmdsl.model.assembly.estimates import Pilot, estimate, named, require_least, unless_short
+from lmdsl.model.assembly.estimates import (
+    Outlook,
+    Pilot,
+    estimate,
+    named,
+    require_least,
+    unless_short,
+)
 from lmdsl.model.assembly.merging import BlockRows, Numbering, merge, merge_one, tile
 from lmdsl.model.assembly.sampler import CHUNK, Block, Sampler
 from lmdsl.model.discretization import Nodes
@@ -89,7 +96,8 @@ def _assembled(
     deadline: Deadline,
 ) -> Transitions:
     pilot = _pilot(sampler, sets)
-    memory.require(estimate(problem, pilot), named(problem, "estimated from a few cells"))
+    need = estimate(problem, pilot)
+    memory.require(need, named(problem, "estimated from a few cells"))
     F, M = len(sets.free), len(sampler.controls)
     guard = partial(deadline.raise_if_over, "compiling")
     shares = shares_of(problem, len(sampler.points), sampler.nodes, guard)
@@ -101,7 +109,7 @@ def _assembled(
     code = _Growing(code_type(len(shares.numerator)), capacity)
     pair_pointer = np.zeros(F + 1, dtype=np.int64)
     pointer.append(np.zeros(1, dtype=np.int64))
-    done = 0
+    done, outlook = 0, Outlook(need, pairs * pilot.entries)
     # glibc returns the memory of a block to the system, to fault it in again for the next one,
     # unless it has seen more than that freed at once.
     np.empty(2**20)
@@ -115,6 +123,8 @@ def _assembled(
         code.append(rows.code)
         done += block.lanes
         deadline.raise_if_over("compiling")
+        if not sampler.asked.singles:  # which say so themselves
+            outlook.done(done / (F * M))
         if progress:
             progress(sampler.asked.stage(done / (F * M)), done / (F * M))
     sampler.asked.again()

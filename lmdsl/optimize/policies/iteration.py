@@ -9,6 +9,7 @@ control only where strictly better keeps every policy gamma-stabilizing, zeros i
 (docs/mathematics.md, Policy iteration).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +58,7 @@ def iterate(
     cost: Floats | None = None,
     time_up: TimeUp = never,
     limit: int | None = None,
+    changes: Callable[[int], None] | None = None,
 ) -> Iteration:
     """Policy iteration from a gamma-stabilizing policy until no control is better.
 
@@ -70,6 +72,8 @@ def iterate(
         Other than the LP's own; ``cost`` has shape (K,).
     time_up, limit
         Asked before every step; largest number of steps.
+    changes
+        Told after every step how many controls it changed.
 
     Notes
     -----
@@ -94,6 +98,8 @@ def iterate(
         out = time_up() or step == limit
         done = screen.improve(V, policy, TIE) if not out else Pass(V, policy, 0, 0)
         exact = None
+        if changes:
+            changes(done.changed)
         if done.changed:
             step += 1
             x = done.value
