@@ -22,6 +22,7 @@ A solver's status plays no part. A claim that almost holds is repaired or refuse
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, NamedTuple
 
+from lmdsl.common.html import grid
 from lmdsl.common.records import jsonable
 from lmdsl.common.types import Floats, Policy
 
@@ -92,6 +93,19 @@ class Certificate:
         """Which claims hold, by name; None is one that is not made."""
         kinds = (bool, Safe)
         return {f.name: getattr(self, f.name) for f in fields(self) if f.type in kinds}
+
+    def _repr_html_(self) -> str:
+        words = {True: "holds", False: "not proved", None: "not made", "assumed": "assumed"}
+        numbers = {"stabilizing": ("contraction", self.contraction),
+                   "upper_bound": ("cost at most", self.cost),
+                   "lower_bound": ("any policy costs at least", self.lower),
+                   "measure": ("residual", self.measure_residual)}  # fmt: skip
+        rows = []
+        for claim, holds in self.claims.items():
+            name, value = numbers.get(claim, ("", None))
+            holds = holds or (None if claim == "refusal" else holds)  # none is aimed at as a rule
+            rows.append((claim, words[holds], "" if value is None else f"{name} {value:.9g}"))
+        return grid(("claim", "", ""), rows, "Certificate", str(self))
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; ``verified`` first, then the attributes."""

@@ -1,6 +1,6 @@
 """The base of everything a user declares: strict, frozen pydantic models with one-line errors."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self, TypeVar
@@ -119,6 +119,27 @@ class _Meta(ModelMetaclass):
             model: Any = cls
             raise condensed(error, model, partial(model._also_wrong, kwargs)) from None
 
+    def __dir__(cls) -> list[str]:  # noqa: N805
+        """Return our own names, and Python's: not all that pydantic adds."""
+        return _own(cls, super().__dir__())
+
+
+# Names of ours that replace pydantic's, and are not what a user looks for.
+UNSAID = {"copy", "elsewhere", "model_construct", "model_copy", "model_validate_json"}
+
+
+def _own(model: Any, names: Iterable[str]) -> list[str]:
+    """Return the names among some that a model of ours declares, and the special ones."""
+    ours = {
+        name
+        for base in model.__mro__
+        if base.__module__.startswith("lmdsl.")
+        for name in vars(base)
+    }
+    ours |= set(model.model_fields)
+    shown = {name for name in ours if not name.startswith(("_", "model_config"))} - UNSAID
+    return sorted(shown | {name for name in names if name.startswith("__")})
+
 
 class Declared(BaseModel, metaclass=_Meta):
     """Base model: unknown keys refused, no coercion, frozen, errors as :class:`BadInput`."""
@@ -129,6 +150,10 @@ class Declared(BaseModel, metaclass=_Meta):
 
     # Keys that have their place in other models, and what to say of one here.
     elsewhere: ClassVar[Mapping[str, str]] = {}
+
+    def __dir__(self) -> list[str]:
+        """Return our own names, and Python's: not all that pydantic adds."""
+        return _own(type(self), super().__dir__())
 
     def replaced(self, **changes: Any) -> Self:
         """Return a copy with some keys changed, validated anew."""

@@ -7,6 +7,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common.html import facts
 from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Floats, Indices
 from lmdsl.control.after_arrival import Held, quantiles
@@ -174,6 +175,21 @@ class Simulation(Frozen):
         return "\n".join(lines)
 
     __str__ = text
+
+    def _repr_html_(self) -> str:
+        low, high = self.interval
+        share = f"{100 * self.reached / self.starts:.4g} %"
+        sure = f"95 % interval {100 * low:.4g} to {100 * high:.4g} %"
+        reached = f"{self.reached:,}: {share} ({sure})"
+        rows = [("reached the attractor", reached)] * self.aimed
+        rows += [("lost", f"{self.lost:,}{self._causes()}")]
+        rows += [("cycling" if self.aimed else "going on", f"{self.cycling:,}")]
+        if self.steps:
+            rows.append(("steps", ", ".join(f"{k} {v:,}" for k, v in self.steps.items())))
+        if self.cost:
+            rows.append(("mean cost", f"{self._mean()}, of {int(self.cost['runs'] or 0):,} runs"))
+        title = f"{self.starts:,} runs of the {self.followed} from random starts"
+        return facts([*rows, ("", self.sentence())], title)
 
     def _paid(self, cost: MeanCost) -> str:
         """Return what runs paid in the mean, whose it is, and what it lacks."""

@@ -61,8 +61,7 @@ class StabilizationLP(Frozen):
     gamma
         Geometric weight of the cost.
     weight
-        The user's m on C, shape (n,), sum 1; zeros outside the support (all zero where no cell of
-        ``measure`` lies in C).
+        The user's m on C, shape (n,), sum 1 (all zero where no cell of ``measure`` lies in C).
     sure_levels
         See :meth:`Successors.sure_levels`; None where successors are not enclosed.
     hold
@@ -250,6 +249,8 @@ class StabilizationLP(Frozen):
     def __repr__(self) -> str:
         sizes = f"{self.n} rows, {self.K} columns, {len(self.rows.target)} transitions"
         return f"StabilizationLP({sizes}, gamma={self.gamma!r})"
+
+    _repr_html_ = stabilizable_set.html
 
 
 @own_arithmetic

@@ -18,10 +18,12 @@ visit per entry in all.
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common.html import facts
 from lmdsl.common.types import Bools, Indices, Statuses
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
@@ -267,3 +269,21 @@ def _keep(kept, pointer, target, code, renumber, new_target, new_code):  # type:
             for e in range(pointer[k], pointer[k + 1]):
                 new_target[at], new_code[at] = renumber[target[e]], code[e]
                 at += 1
+
+
+def counted(cell_status: Statuses) -> list[tuple[str, int]]:
+    """Return how many cells have each status, in words; those that none has are left out."""
+    count = np.bincount(cell_status, minlength=len(CellStatus))
+    return [(s.name.lower().replace("_", " "), int(count[s])) for s in CellStatus if count[s]]
+
+
+def html(lp: Any) -> str:
+    """Return a table of the sizes of a model on its stabilizable set, as notebooks show it."""
+    sizes = [("rows (cells of C)", lp.n), ("columns (surviving pairs)", lp.K),
+             ("transitions", len(lp.rows.target)), ("controls", len(lp.controls))]  # fmt: skip
+    cells = [f"{number:,} {name}" for name, number in counted(lp.cell_status)]
+    rows = [("problem", lp.problem.name)] * bool(lp.problem.name)
+    rows += [(name, f"{number:,}") for name, number in sizes]
+    return facts(
+        [*rows, ("gamma", repr(lp.gamma)), ("cells", "\n".join(cells))], "Stabilization LP"
+    )

@@ -6,6 +6,9 @@ drawn. A layer takes any matplotlib axes.
 """
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -21,6 +24,8 @@ INK, FAINT = "#222222", "#999999"
 CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555")
 MOST_LEVELS = 11  # that a colour bar names
 
+_apart: ContextVar[bool] = ContextVar("apart", default=False)
+
 
 def blank(columns: float = 1, rows: float = 1) -> Any:
     """Return an empty figure on an Agg canvas.
@@ -30,8 +35,9 @@ def blank(columns: float = 1, rows: float = 1) -> Any:
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
         from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+        from lmdsl.plotting.shown import Picture, offer
     except ImportError:
         raise MissingDependency('plots need matplotlib: pip install "lmdsl[plot]"') from None
     except ValueError:
@@ -39,18 +45,34 @@ def blank(columns: float = 1, rows: float = 1) -> Any:
         raise BadInput(
             f"{backend} is no backend of matplotlib here; unset it", "MPLBACKEND"
         ) from None
-    figure = Figure(
+    figure = Picture(
         figsize=(4.4 * columns + 0.3, 3.9 * rows + 0.3),
         dpi=110,
         layout=ConstrainedLayoutEngine(w_pad=0.1, h_pad=0.1),
     )
     FigureCanvasAgg(figure)
+    if not _apart.get():
+        offer(figure)
     return figure
+
+
+@contextmanager
+def apart() -> Iterator[None]:
+    """Make figures that no notebook shows by themselves: parts of something else."""
+    token = _apart.set(True)
+    try:
+        yield
+    finally:
+        _apart.reset(token)
 
 
 def frame(ax: Any, view: View, title: str) -> Any:
     """Return axes with the names and ends of a view, new ones if there are none."""
-    ax = blank().add_subplot() if ax is None else ax
+    if ax is None:
+        figure = blank()
+        from lmdsl.plotting.shown import Panel
+
+        ax = figure.add_subplot(axes_class=Panel)
     ax.set_title(title, fontsize=11)
     ax.set_box_aspect(1)
     ax.set_xlabel(view.label(0))

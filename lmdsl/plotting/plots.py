@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lmdsl.common import inputs
-from lmdsl.common.types import Bools
 from lmdsl.explanation.causes import Explanation
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.stabilizable_set import CellStatus
@@ -63,9 +62,7 @@ def cost(
     -------
     matplotlib.axes.Axes
     """
-    levels = result.sure_levels
-    sure = None if levels is None else levels > 0
-    return _drawn(result, "cost", ax, (axes, at, project), legend, sure=sure)
+    return _drawn(result, "cost", ax, (axes, at, project), legend)
 
 
 @own_arithmetic
@@ -218,7 +215,6 @@ def _drawn(
     shown: tuple[Sequence[str] | None, At | None, Projection | None],
     legend: bool,
     name: str | None = None,
-    sure: Bools | None = None,
 ) -> Axes:
     """Draw a quantity of a result and the regions."""
     inputs.kind(result, Result, "result", "a Result")
@@ -226,5 +222,7 @@ def _drawn(
     view = view_of(result, *shown)
     drawn: Axes = layers.frame(ax, view, quantity.title + view.note)
     quantity.draw(drawn, view)
+    levels = result.sure_levels if draw == "cost" else None
+    sure = None if levels is None else levels > 0
     regions.regions(drawn, view, quantity.codes(result), legend, sure=sure)
     return drawn

@@ -1,7 +1,7 @@
 """What the user writes: the problem file as one strict, frozen model, and its reader.
 
-Reading never runs code, opens no other file, and costs time and memory in proportion to the
-file (at most 16 MiB). Geometry is resolved later, in partition.py.
+Reading never runs code, opens no other file, and costs time and memory in proportion to the file.
+Geometry is resolved later, in partition.py.
 """
 
 import json
@@ -18,6 +18,7 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.language import Formula, defined
 from lmdsl.formulas.names import FormulaText, Let
 from lmdsl.formulas.program import Program
+from lmdsl.problem import words
 from lmdsl.problem.axes import StateBox
 from lmdsl.problem.consistency import endings, texts
 from lmdsl.problem.consistency.keys import PLACES, require_consistent, require_writable
@@ -166,8 +167,7 @@ class Problem(Declared):
         where
             The path of its field.
         kinds
-            What may stand in it beside parameters and constants: names of states, of controls and
-            of noise variables; and what ``let`` defines by these.
+            Of what names may stand in it beside parameters and constants, and by which ``let``.
         condition
             Whether it is a condition.
 
@@ -248,8 +248,7 @@ class Problem(Declared):
 
     def conditions(self, where: str) -> tuple[Formula, ...]:
         """Return the conditions of ``attractor``, ``avoid`` or ``measure``."""
-        part = getattr(self, where)
-        written = () if part is None or part.where is None else part.where
+        written = getattr(getattr(self, where), "where", None) or ()
         if isinstance(written, str):
             return (self.formula(written, f"{where}.where", texts.STATES, condition=True),)
         return tuple(
@@ -270,8 +269,8 @@ class Problem(Declared):
         order = (self.states, self.controls) == (other.states, other.controls)
         return order and super().__eq__(other)
 
-    def __hash__(self) -> int:
-        return super().__hash__()
+    __hash__ = Declared.__hash__
+    _repr_html_ = words.html
 
     def to_dict(self) -> dict[str, Any]:
         """Return the problem as plain data that ``json.dumps`` accepts, defaults written out."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common import inputs
+from lmdsl.common import html, inputs
 from lmdsl.common.records import Reported
 from lmdsl.common.types import FilePath, Progress
 from lmdsl.errors import BadInput, printable, shown
@@ -23,6 +23,11 @@ from lmdsl.results.status import Status
 
 # Compared where none is named: those that every installation has.
 BACKENDS = ("policy-iteration", "highs", "clarabel", "cvxpy")
+
+HEAD = (
+    "backend", "status", "cost", "lower bound", "gap", "gap before polish", "polish", "iterations",
+    "seconds",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -68,24 +73,29 @@ class Comparison(Reported):
 
     def table(self) -> str:
         """Return the comparison as text."""
-        head = ("backend", "status", "cost", "lower bound", "gap", "gap before polish", "polish",
-                "iterations", "seconds")  # fmt: skip
-        rows = [head, *(_row(result) for result in self.results)]
-        widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
+        rows = [HEAD, *(_row(result) for result in self.results)]
+        widths = [max(len(row[k]) for row in rows) for k in range(len(HEAD))]
         lines = ["  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) for row in rows]
         lines.insert(1, "  ".join("-" * w for w in widths))
-        for result in self.results:
-            if result.status != Status.VERIFIED:
-                lines.append(printable(f"{result.backend}: {result.message}"))
+        return "\n".join(line.rstrip() for line in [*lines, *self._notes()])
+
+    __str__ = table
+
+    def _repr_html_(self) -> str:
+        rows = [_row(result) for result in self.results]
+        return html.grid(HEAD, rows, "Comparison", "\n".join(self._notes()))
+
+    def _notes(self) -> list[str]:
+        """Return what is said below the table."""
+        failed = [result for result in self.results if result.status != Status.VERIFIED]
+        notes = [printable(f"{result.backend}: {result.message}") for result in failed]
         if self.agreement:
             a = self.agreement
-            lines.append(
+            notes.append(
                 f"agreement: costs within {a.cost:.2g}, values within {a.value:.2g}, "
                 f"{100 * a.controls:.4g} % of the controls equal or tied"
             )
-        return "\n".join(line.rstrip() for line in lines)
-
-    __str__ = table
+        return notes
 
 
 def _row(result: Result) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ from typing import Any, Self, cast
 import numpy as np
 
 from lmdsl.certificate.claims import Safe
+from lmdsl.common.html import facts
 from lmdsl.common.records import Frozen, Reported, jsonable
 from lmdsl.common.types import Progress, Statuses
 from lmdsl.control.accuracy import IntegrationError
@@ -218,6 +219,28 @@ class Summary(Frozen):
     def beyond_gamma(self) -> Area | None:
         """The cells proved infeasible at this gamma, by region; None where none is."""
         return None
+
+    def _repr_html_(self) -> str:
+        def known(value: float | None, digits: str = ".9g") -> str:
+            return "not established" if value is None else format(value, digits)
+
+        problem = getattr(self, "problem", None)
+        rows: list[tuple[str, Any]] = (
+            [("problem", problem.name)] if problem and problem.name else []
+        )
+        rows += [("status", self.status), ("", self.message), ("backend", self.backend)]
+        if self.cost is not None or self.lower_bound is not None:
+            bounds = f"{known(self.cost)} (lower bound {known(self.lower_bound)})"
+            rows += [("cost", bounds), ("gap", known(self.gap, ".2g"))]
+            rows.append(("contraction", known(self.contraction)))
+        rows += [("gamma", repr(self.gamma)), ("coverage", self.coverage or f"{self.cells} cells")]
+        if self.gamma_bar:
+            rows.append(("gamma_bar", "{:.9g} to {:.9g}".format(*self.gamma_bar)))
+        beside = (self.local_controller, self.integration_error, self.simulation)
+        names = ("local controller", "integration", "true map")
+        rows += [(name, x.sentence()) for name, x in zip(names, beside, strict=True) if x]
+        spent = [f"{name} {x:.3f}" for name, x in vars(self.seconds).items() if x is not None]
+        return facts([*rows, ("seconds", ", ".join(spent) or "-")], "Result")
 
     @property
     def exit_status(self) -> int:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MOST = 64  # panels of a page
 SLICES = (6, 4)  # slices along an axis, where one is cut through, and where two are
 
-Places = Mapping[str, float | Sequence[float]]
+Cuts = Mapping[str, float | Sequence[float]]
 
 
 @own_arithmetic
@@ -37,7 +37,7 @@ def slices(
     path: str | os.PathLike[str] | None = None,
     *,
     axes: Sequence[str] | None = None,
-    at: Places | None = None,
+    at: Cuts | None = None,
     panels: int | None = None,
 ) -> Figure:
     """Draw one quantity on slices along one or two axes, all in the same colours.
