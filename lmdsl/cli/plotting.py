@@ -11,12 +11,15 @@ from lmdsl.cli.streams import say
 from lmdsl.errors import BadInput, printable, shown
 
 PAGES = ("page", "slices", "projections")
+FILMS = (".gif", ".mp4")
 QUANTITIES = ("cost", "control", "measure", "coverage")
 
 
 def add(plot: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    plot.add_argument("--out", metavar="FILE", help="PNG, PDF or SVG (default DIR/figures.png)")
+    plot.add_argument(
+        "--out", metavar="FILE", help="PNG, PDF or SVG (default DIR/figures.png); GIF, MP4: a film"
+    )
     plot.add_argument("--axes", metavar="X,Y", help="the one or two axes shown")
     plot.add_argument("--at", metavar="Z=1,V=0", help="where other axes are held; of slices, where "
                       "they are: Z=1,2,3")  # fmt: skip
@@ -53,6 +56,8 @@ def _draw(parsed: Arguments, stored: Any, path: Path, axes: list[str] | None, at
         if axes is not None:
             raise BadInput("projections are onto all pairs of axes; leave it out", "--axes")
         plotting.projections(result, *what, path, at=at, project=parsed.project or "worst")
+    elif path.suffix.lower() in FILMS:
+        plotting.animate(result, path, axes=axes, at=at, project=parsed.project)
     else:
         proof = proved.as_stored(parsed.dir, result, stored.certificate.proof)
         cut: Any = {"axes": axes, "at": at, "project": parsed.project}

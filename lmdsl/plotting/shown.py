@@ -9,6 +9,7 @@ from __future__ import annotations
 import warnings
 from importlib import import_module
 from io import BytesIO
+from typing import Protocol
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -38,11 +39,17 @@ class Panel(Axes):
         return picture._repr_png_() if isinstance(picture, Picture) else None
 
 
-_waiting: list[Picture] = []
+class Showable(Protocol):
+    """What a notebook shows, and whether it has."""
+
+    seen: bool
+
+
+_waiting: list[Showable] = []
 _shells: set[int] = set()
 
 
-def offer(picture: Picture) -> None:
+def offer(picture: Showable) -> None:
     """Show a figure at the end of the cell of a notebook that is running, unless it is shown."""
     shell = notebook()
     if shell is None:
