@@ -29,7 +29,7 @@ from lmdsl.problem.sampling import SamplingUnion
 from lmdsl.problem.sets import REACHED_OR_ENDED, Attractor, Avoid, Measure
 from lmdsl.problem.unions import SystemUnion
 from lmdsl.systems import FunctionSystem
-from lmdsl.systems.base import Judged, Names, StateMap
+from lmdsl.systems.base import Names, StateMap
 from lmdsl.systems.black_box.cost import StageCost, cost_map
 from lmdsl.systems.runge_kutta import RungeKutta
 
@@ -200,10 +200,9 @@ class Problem(Declared):
         return Program(formulas, self.system.constants())
 
     @property
-    def judged(self) -> Judged:
+    def judged(self) -> str:  # a Literal type ends what completes names in notebooks
         """Whether ``path`` or ``endpoint`` of a step is judged; a map has no path."""
-        judged: Judged = getattr(self.system, "judged", "endpoint")
-        return judged
+        return str(getattr(self.system, "judged", "endpoint"))
 
     def flow(self, cost: bool = True) -> RungeKutta | None:
         """Return how the equation, and with it the cost rate, is integrated; None for a map."""

@@ -108,3 +108,17 @@ def test_completion_offers_our_names_only(result):
             assert hasattr(problem, name)
     assert {*lm.Problem.model_fields, "replaced", "save", "to_dict", "states"} <= set(dir(problem))
     assert "__class__" in dir(problem)
+
+
+def test_what_completes_names_in_notebooks_gets_along_with_all_of_them(result):
+    """It runs into errors of its own, and offers nothing, at some types of properties."""
+    jedi = pytest.importorskip("jedi")
+    objects = {
+        "problem": result.problem, "axis": result.problem.state_box["x"], "lp": result.lp,
+        "system": result.problem.system, "result": result, "certificate": result.certificate,
+        "controller": result.controller, "runs": result.simulate(5, 5), "lm": lm,
+        "partition": result.partition, "check": lm.check(made(steps())),
+    }  # fmt: skip
+    for name, item in objects.items():
+        found = {each.name for each in jedi.Interpreter(f"{name}.", [objects]).complete()}
+        assert {each for each in dir(item) if not each.startswith("_")} <= found, name
