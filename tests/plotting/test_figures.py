@@ -81,6 +81,7 @@ def test_nothing_is_written_where_it_cannot_be(solved, tmp_path):
 
 def test_without_matplotlib_the_fix_is_named(solved, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    monkeypatch.delitem(sys.modules, "lmdsl.plotting.shown", raising=False)
     for draw in (plotting.portrait, plotting.cost, plotting.figure):
         with pytest.raises(MissingDependency) as caught:
             draw(solved("maze"))
