@@ -185,19 +185,33 @@ def image(ax: Any, view: View, values: Floats, colours: Any) -> Any:
 
 
 def _with_bar(ax: Any, picture: Any, label: str, own: bool, options: dict[str, Any]) -> Any:
-    """Add a colour bar exactly as high as the axes, or keep what a bar for several needs."""
+    """Add a colour bar, or keep what one for several panels needs."""
     picture.bar = {"label": label, **options}
     if own:
-        bar(ax.get_figure(), picture, cax=ax.inset_axes((1.04, 0, 0.05, 1)))
+        names = options.pop("names", None)
+        _name(bar(ax, picture, label, **options), names)
     return picture
 
 
-def bar(figure: Any, picture: Any, **place: Any) -> None:
-    """Add the colour bar of a picture to a figure."""
+def bar(ax: Any, picture: Any, label: str, **options: Any) -> Any:
+    """Add a colour bar exactly as high as the axes."""
+    made = ax.get_figure().colorbar(picture, cax=ax.inset_axes((1.04, 0, 0.05, 1)), **options)
+    made.set_label(label)
+    return made
+
+
+def shared_bar(panels: list[Any], picture: Any) -> None:
+    """Add a colour bar for several panels, as one of their pictures says."""
     options = dict(picture.bar)
     label, names = options.pop("label"), options.pop("names", None)
-    made = figure.colorbar(picture, **place, **options)
+    figure = panels[0].get_figure()
+    made = figure.colorbar(picture, ax=panels, shrink=0.7, aspect=30, **options)
     made.set_label(label)
+    _name(made, names)
+
+
+def _name(made: Any, names: list[str] | None) -> None:
+    """Name the levels of a colour bar."""
     if names is not None:
         made.ax.minorticks_off()
         made.set_ticklabels(names)

@@ -153,7 +153,7 @@ def _page(
         for ax in panels:
             ax.label_outer()
     if picture is not None:
-        layers.bar(page, picture, ax=panels, shrink=0.7, aspect=30)
+        layers.shared_bar(panels, picture)
     if handles:
         page.legend(
             handles=list(handles.values()), loc="outside lower center", ncols=6, frameon=False

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Iterator
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 from lmdsl.advice.studies.orders import held_of, width
 from lmdsl.advice.studies.record import Study, StudyRow
 from lmdsl.common import inputs
-from lmdsl.common.files import write_whole
-from lmdsl.errors import BadInput, shown
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.plotting.pages.writing import FORMATS
+from lmdsl.plotting import layers
+from lmdsl.plotting.pages import writing
 from lmdsl.plotting.view import number, plain
 
 if TYPE_CHECKING:
@@ -64,16 +61,11 @@ def study(found: Study, path: str | os.PathLike[str] | None = None) -> Figure:
     BadInput
         The ending is unknown, or the file cannot be written.
     """
-    from matplotlib.figure import Figure
-
     inputs.kind(found, Study, "found", "a Study")
-    target = None if path is None else inputs.path(path)
-    kind = "" if target is None else target.suffix[1:].lower()
-    if target is not None and kind not in FORMATS:
-        raise BadInput(f"{shown(str(target), 200)}: a plot ends in .png, .pdf or .svg")
+    target = writing.target(path)
     turned = [name for name in LABELS if len({str(getattr(r, name)) for r in found.rows}) > 1]
     knobs = turned or ["cells"]
-    figure = Figure(figsize=(4.2 * len(knobs) + 1, 2.4 * len(PANELS)), layout="constrained")
+    figure: Figure = layers.blank(0.95 * len(knobs) + 0.15, 0.6 * len(PANELS))
     axes = figure.subplots(len(PANELS), len(knobs), squeeze=False, sharex="col")
     for k, knob in enumerate(knobs):
         for ax, (title, read, log) in zip(axes[:, k], PANELS, strict=True):
@@ -83,13 +75,7 @@ def study(found: Study, path: str | os.PathLike[str] | None = None) -> Figure:
         if 1 < len(axes[0, k].get_lines()) <= MOST_LINES:
             axes[0, k].legend(fontsize="x-small", framealpha=0.5)
     figure.suptitle(plain(found.name, 100))
-    if target is not None:
-        content = BytesIO()
-        stamp = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(kind)
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", message="Glyph .* missing from")
-            figure.savefig(content, format=kind, dpi=150, metadata=stamp)
-        write_whole(target, content.getvalue())
+    writing.write(figure, target)
     return figure
 
 
