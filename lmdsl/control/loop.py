@@ -20,9 +20,9 @@ from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
-from lmdsl.problem.changing import with_parameters
 from lmdsl.problem.local_control import HoldControl, absorbed_on_way
 from lmdsl.problem.problem import Problem
+from lmdsl.problem.whole.changing import with_parameters
 from lmdsl.systems import DataSystem, MatrixSystem
 from lmdsl.systems.matrices.system import Draws
 from lmdsl.systems.named import NotStored

@@ -35,7 +35,7 @@ from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.successors.left_out.dropping import left_out
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem import Problem, given
-from lmdsl.problem.changing import with_gamma_alone
+from lmdsl.problem.whole.changing import with_gamma_alone
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,6 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.formulas.language import Formula, defined
 from lmdsl.formulas.names import FormulaText, Let
 from lmdsl.formulas.program import Program
-from lmdsl.problem import words
 from lmdsl.problem.axes import StateBox
 from lmdsl.problem.consistency import endings, texts
 from lmdsl.problem.consistency.keys import PLACES, require_consistent, require_writable
@@ -28,6 +27,7 @@ from lmdsl.problem.noise import Noise
 from lmdsl.problem.sampling import SamplingUnion
 from lmdsl.problem.sets import REACHED_OR_ENDED, Attractor, Avoid, Measure
 from lmdsl.problem.unions import SystemUnion
+from lmdsl.problem.whole import words
 from lmdsl.systems import FunctionSystem
 from lmdsl.systems.base import Names, StateMap
 from lmdsl.systems.black_box.cost import StageCost, cost_map

@@ -8,8 +8,8 @@ from lmdsl import backends
 from lmdsl.common import inputs
 from lmdsl.errors import BadInput, shown
 from lmdsl.explanation.remedies import with_cells
-from lmdsl.problem.changing import with_samples, with_step
 from lmdsl.problem.problem import Problem
+from lmdsl.problem.whole.changing import with_samples, with_step
 from lmdsl.systems import MatrixSystem
 
 KNOBS = ("step", "samples", "cells", "gamma", "backend")  # the last changes fastest

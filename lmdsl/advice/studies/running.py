@@ -15,7 +15,7 @@ from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.problem import Problem, given
-from lmdsl.problem.changing import gamma_alone
+from lmdsl.problem.whole.changing import gamma_alone
 from lmdsl.results.result import Result
 from lmdsl.results.solving import TOLERANCE, solve
 

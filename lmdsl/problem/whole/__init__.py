@@ -1,0 +1,1 @@
+"""A problem as a whole: changed copies of it, and what it says in words."""
