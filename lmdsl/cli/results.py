@@ -30,6 +30,8 @@ def add(command: Command) -> None:
     simulate.add_argument("--seed", type=int, default=0, metavar="S")
     simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
                           help="with a local controller, steps after the arrival")  # fmt: skip
+    simulate.add_argument("--interpolated", action="store_true",
+                          help="also under the controller interpolated between cells")  # fmt: skip
     simulate.add_argument("--as-compiled", action="store_true",
                           help="follow the compiled steps and noise nodes")  # fmt: skip
     shared(simulate, "--time-limit", "--json")
@@ -79,21 +81,27 @@ def _verify(parsed: Arguments) -> int:
 
 
 def _simulate(parsed: Arguments) -> int:
+    from lmdsl.control.controller import Law
     from lmdsl.results.result import Result
 
     result = Result.load(parsed.dir)
+    laws: list[Law] = ["constant", "interpolated"]
     with ProgressLine() as progress:
         progress("simulate", -1.0)
-        runs = result.simulate(
-            parsed.starts if parsed.given is None else [states(text) for text in parsed.given],
-            parsed.steps, parsed.seed, parsed.hold, parsed.time_limit,
-            as_compiled=parsed.as_compiled, parameters=parameters(parsed.parameter),
-        )  # fmt: skip
+        found = [
+            result.simulate(
+                parsed.starts if parsed.given is None else [states(text) for text in parsed.given],
+                parsed.steps, parsed.seed, parsed.hold, parsed.time_limit,
+                as_compiled=parsed.as_compiled, parameters=parameters(parsed.parameter), mode=law,
+            )
+            for law in laws[: 1 + parsed.interpolated]
+        ]  # fmt: skip
     if parsed.json:
-        print_json(runs.to_dict())
+        report, *others = (runs.to_dict() for runs in found)
+        print_json({**report, "interpolated": others[0] if others else None})
         print(f"lmdsl: {AS_STORED}", file=sys.stderr)
         return 0
-    say(f"{runs.text()}\n({AS_STORED})")
+    say("\n".join([*(runs.text() for runs in found), f"({AS_STORED})"]))
     return 0
 
 

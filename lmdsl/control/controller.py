@@ -115,6 +115,10 @@ class Interpolated:
         self.local = controller.local
         self.low, self.high = self.vectors.min(axis=0), self.vectors.max(axis=0)
 
+    def law(self, mode: Law) -> "Controller | Interpolated":
+        """See :meth:`Controller.law`."""
+        return self if mode == self.mode else self.controller.law(mode)
+
     def at(self, cell: Indices, x: Floats | None = None) -> Floats:
         """Return the control at states x, shape (r, d), of given cells, shape (r, p)."""
         u = self.controller.at(cell, x)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from lmdsl.common import inputs
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.control.after_arrival import Held, goes_on
-from lmdsl.control.controller import Controller
+from lmdsl.control.controller import Controller, Interpolated, Law
 from lmdsl.control.integration import Integrator
 from lmdsl.control.steps import CompiledSteps, Drawn, Moved, Steps
 from lmdsl.errors import BadInput
@@ -80,7 +80,7 @@ class ClosedLoop:
     def __init__(
         self,
         problem: Problem,
-        controller: Controller,
+        controller: Controller | Interpolated,
         status: Statuses,
         as_compiled: bool = False,
         declared: Problem | None = None,
@@ -108,6 +108,13 @@ class ClosedLoop:
         if self.as_compiled:
             return self
         return ClosedLoop(self.problem, self.controller, self.status, True, self.declared)
+
+    def by(self, mode: Law) -> "ClosedLoop":
+        """Return the same under a law of the controller; see :meth:`Controller.law`."""
+        law = self.controller.law(mode)
+        if law is self.controller:
+            return self
+        return ClosedLoop(self.problem, law, self.status, self.as_compiled, self.declared)
 
     def under(self, parameters: Mapping[str, float]) -> "ClosedLoop":
         """Return the same controller and cells with other parameters of the system."""

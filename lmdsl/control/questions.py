@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
 from lmdsl.common.types import Floats, Statuses
-from lmdsl.control.controller import Controller
+from lmdsl.control.controller import Controller, Law
 from lmdsl.control.loop import CYCLING, LOSSES, LOST, OUTCOMES, REACHED, ClosedLoop, draw_starts
 from lmdsl.control.simulation import Simulation, simulate
 from lmdsl.errors import BadInput
@@ -101,11 +101,11 @@ class InUse:
         """The true map under the controller."""
         return ClosedLoop(self.problem, self.controller, self.cell_status)
 
-    def _loop(self, as_compiled: Any, parameters: Any) -> ClosedLoop:
+    def _loop(self, as_compiled: Any, parameters: Any, mode: Law) -> ClosedLoop:
         """Return the loop to be followed."""
         if (self.control_index < 0).all():
             raise BadInput("there is no controller to simulate: " + self.message)
-        loop = self.closed_loop
+        loop = self.closed_loop.by(mode)
         if inputs.flag(as_compiled, "as_compiled"):
             loop = loop.compiled
         return loop if parameters is None else loop.under(parameters)
@@ -141,6 +141,7 @@ class InUse:
         *,
         as_compiled: bool = False,
         parameters: Mapping[str, float] | None = None,
+        mode: Law = "constant",
     ) -> Simulation:
         """Run the true map under the controller from fresh random starts, or from given ones.
 
@@ -163,6 +164,8 @@ class InUse:
         parameters
             Other values of parameters of the system, by name: the controller and the cells stay,
             the map and its costs change.
+        mode
+            ``constant`` on cells, as certified, or ``interpolated``, as for the controller.
 
         Raises
         ------
@@ -176,7 +179,7 @@ class InUse:
         steps = inputs.whole(steps, "steps")
         hold, seed = inputs.whole(hold, "hold"), inputs.seed(seed)
         deadline = Deadline.of(time_limit)
-        loop = self._loop(as_compiled, parameters)
+        loop = self._loop(as_compiled, parameters, mode)
         # States, images and their cells, controls, noise, and the arrays of the formulas.
         wide, live = len(loop.true_map.names), loop.true_map.map.live
         memory.require(8 * count * (16 * wide + 12 + live), "runs")
@@ -209,6 +212,7 @@ class InUse:
         *,
         as_compiled: bool = False,
         parameters: Mapping[str, float] | None = None,
+        mode: Law = "constant",
     ) -> Trajectory:
         """Follow one run of the true map until it enters A or is lost.
 
@@ -218,7 +222,7 @@ class InUse:
             The state to start from, shape (d,), or by name.
         steps
             Steps at most.
-        seed, as_compiled, parameters
+        seed, as_compiled, parameters, mode
             As for :meth:`simulate`.
 
         Raises
@@ -229,7 +233,7 @@ class InUse:
         start, steps = self._given(x), inputs.whole(steps, "steps", 0)
         if len(start) != 1:
             raise BadInput(f"a path starts in one state, not in {len(start)}", "x")
-        loop = self._loop(as_compiled, parameters)
+        loop = self._loop(as_compiled, parameters, mode)
         return follow(loop, start, steps, np.random.default_rng(inputs.seed(seed)))
 
 

@@ -99,6 +99,8 @@ class Simulation(Frozen):
         equation; None of a map, and if none arrives.
     given
         The starts were given, not drawn.
+    law
+        Of the controller: ``constant`` on cells, as certified, or ``interpolated``.
     each
         What became of each run; not compared.
     """
@@ -119,6 +121,7 @@ class Simulation(Frozen):
     followed: str = "true map"
     times: dict[str, float] | None = None
     given: bool = False
+    law: str = "constant"
     each: EachRun | None = field(default=None, compare=False, repr=False)
 
     def to_dict(self) -> dict[str, Any]:
@@ -156,6 +159,8 @@ class Simulation(Frozen):
         ]
         if not self.aimed:
             lines[1:4] = [lines[2], f"  going on               {self.cycling}  (no target)"]
+        if self.law != "constant":
+            lines.insert(1, f"  control                {self.law} between cells, not as certified")
         if self.method not in (AS_DECLARED, self.followed):
             lines.insert(1, f"  followed               {self.method}")
         if self.cut:
@@ -297,6 +302,7 @@ def simulate(
         followed=loop.followed,
         times=in_time,
         given=given,
+        law=loop.controller.mode,
         each=EachRun.of(loop, x, runs),
     )
 

@@ -1,13 +1,16 @@
 """Interpolated control: laws that are affine are met exactly, jumps stay, hulls are not left."""
 
 import itertools
+import json
 
 import numpy as np
 import pytest
 from problems import made, standard_map, steps
 
 import lmdsl as lm
+from lmdsl import cli
 from lmdsl.control.controller import Controller
+from lmdsl.control.loop import ClosedLoop
 from lmdsl.model.grid.partition import Partition
 
 
@@ -128,3 +131,68 @@ def test_what_cannot_be_interpolated_is_refused():
     finite = lm.solve(lm.from_matrices([[[0.5, 0.5], [0, 1]]], [[1.0], [0.0]], targets=[1]))
     with pytest.raises(lm.BadInput, match="mode: a finite model"):
         finite.controller([[0.0]], mode="interpolated")
+
+
+# In closed loop -------------------------------------------------------------------------------
+
+
+def test_runs_follow_the_interpolated_law():
+    """Steps of the map by hand, under what the controller says in each state."""
+    result = lm.solve(made(standard_map(25)))
+    differs = False
+    for x in ([0.1, 0.2], [0.9, 0.4], [0.33, 0.71]):
+        run = result.path(x, mode="interpolated")
+        u = result.controller(run.states[:-1], mode="interpolated")
+        np.testing.assert_array_equal(run.controls, u)
+        differs |= not np.array_equal(u, result.controller(run.states[:-1]))
+        for (a, b), (v,), after in zip(run.states, u, run.states[1:], strict=False):
+            kick = 0.25 * v * np.sin(2 * np.pi * a)
+            np.testing.assert_allclose(after, [(a + b + kick) % 1, (b + kick) % 1], atol=1e-12)
+    assert differs
+
+
+def test_it_has_figures_of_its_own(tmp_path, capsys):
+    result = lm.solve(made(standard_map(25)))
+    plain, smooth = (result.simulate(500, mode=mode) for mode in ("constant", "interpolated"))
+    assert plain == result.simulate(500)
+    assert (plain.law, smooth.law) == ("constant", "interpolated")
+    assert smooth.cost["mean"] != plain.cost["mean"]
+    assert "interpolated between cells, not as certified" in smooth.text()
+    assert "interpolated" not in plain.text()
+    result.save(tmp_path / "out")
+    command = ["simulate", str(tmp_path / "out"), "--starts", "500", "--interpolated"]
+    assert cli.main([*command, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found.pop("interpolated") == smooth.to_dict()
+    assert found == plain.to_dict()
+    assert cli.main(command) == 0
+    out = capsys.readouterr().out
+    assert out.index("500 runs") < out.index("interpolated between cells")
+    assert cli.main([*command[:-1], "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["interpolated"] is None
+
+
+def test_a_local_feedback_stays():
+    local = {"kind": "linear", "gain": {"u": {"x": 0.3, "y": 0.7}},
+             "orbit": [{"x": 0.25, "y": 0.5}, {"x": 0.75, "y": 0.5}]}  # fmt: skip
+    law = lm.solve(made(standard_map(20, local_controller=local))).controller
+    cells = np.flatnonzero(law.local.attractor)
+    x = law.partition.centres(cells) + 0.01
+    np.testing.assert_array_equal(law(x, mode="interpolated"), law(x))
+
+
+def test_an_affine_plant_is_followed_to_the_reference():
+    """A law that is affine between centres drives x+ = x + u as the affine law does."""
+    data = steps(
+        system={"kind": "map", "next": {"x": "x + u"}},
+        state_box={"x": {"low": -1, "high": 1, "cells": 41}},
+        attractor={"cells": [[20]]},
+        control_grid={"u": {"low": -0.5, "high": 0.5, "points": 41}},
+    )
+    result = lm.solve(made(data))
+    centres = result.partition.centres(np.arange(41))
+    law = controller(result.partition, -0.5 * centres, missing=[20])
+    loop = ClosedLoop(result.problem, law, result.cell_status).by("interpolated")
+    path = loop.path([0.9], 10)[:, 0]
+    assert len(path) > 4
+    np.testing.assert_allclose(path[:-1], 0.9 * 0.5 ** np.arange(len(path) - 1), rtol=1e-12)
