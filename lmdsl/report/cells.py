@@ -20,7 +20,7 @@ from lmdsl.results.result import Result
 from lmdsl.results.status import Status
 
 MOST_DRAWN = 250_000  # cells of which values are given
-MOST_FULL = 4_000_000  # cells of which controls and statuses are given
+MOST_FULL = 2_000_000  # cells of which controls and statuses are given
 MOST_CONTROLS = 4  # controls that are drawn
 
 # What a region is called, how light it is (0 black, 1 white), and the mark that tells it apart

@@ -1,6 +1,7 @@
 """The problem as it was declared: what it says in words, and in mathematics."""
 
 from collections.abc import Collection, Iterable, Mapping
+from itertools import islice
 from typing import Any
 
 from lmdsl.model.discretization import control_count, sample_points
@@ -14,7 +15,8 @@ from lmdsl.systems import FunctionSystem, MapSystem, MatrixSystem, NamedSystem, 
 from lmdsl.systems.matrices.data import DataSystem
 
 MOST = 8  # boxes, points or formulas of a set that are written out
-LONGEST = 60  # formulas that are written out
+LONGEST = 60  # formulas and parameters that are written out
+MOST_ROWS = 200  # of the table
 
 DeclaredRow = dict[str, Any]  # ``name``, ``text`` and, where there is mathematics, ``math``
 
@@ -22,13 +24,14 @@ DeclaredRow = dict[str, Any]  # ``name``, ``text`` and, where there is mathemati
 def problem_of(result: Result) -> dict[str, Any]:
     """Return what a problem says as plain data: a summary, equations, and a table."""
     problem = result.problem
+    rows = [*_states(problem), *_controls(problem), *_noises(problem), *_sets(problem),
+            *_rest(problem)]  # fmt: skip
     return {
         "summary": _summary(problem),
         "equations": _equations(problem),
         "objective": _objective(problem),
-        "rows": [*_states(problem), *_controls(problem), *_noises(problem), *_sets(problem),
-                 *_rest(problem)],
-    }  # fmt: skip
+        "rows": rows[:MOST_ROWS],
+    }
 
 
 def _names(problem: Problem) -> frozenset[str]:
@@ -99,8 +102,11 @@ def _equations(problem: Problem) -> list[str]:
         image = f"<mi>T</mi><mo>(</mo>{inside}<mo>)</mo>"
         found.append(m.block(f"<msup><mi>x</mi><mo>+</mo></msup><mo>=</mo>{image}"))
     if problem.let:
-        rows = [m.equation(m.name(k), m.shown(v, names)) for k, v in problem.let.items()]
-        found.append(m.table(rows[:LONGEST]))
+        rows = [
+            m.equation(m.name(k), m.shown(v, names))
+            for k, v in islice(problem.let.items(), LONGEST)
+        ]
+        found.append(m.table(rows))
     return found
 
 
@@ -233,11 +239,12 @@ def _rest(problem: Problem) -> Iterable[DeclaredRow]:
     yield from _costs(problem, names)
     constants = problem.system.constants()
     if constants:
+        left = len(constants) - LONGEST
         values = (
             m.block(f"{m.name(k)}<mo>=</mo><mn>{m.number(v, 9)}</mn>", False)
-            for k, v in constants.items()
+            for k, v in islice(constants.items(), LONGEST)
         )
-        yield _row("parameters", "", *values)
+        yield _row("parameters", f"{left:,} more are not listed here" if left > 0 else "", *values)
     step = getattr(problem.system, "step", None)
     if isinstance(step, int | float):
         judged = "judged all along its path" if problem.judged == "path" else "judged at its end"

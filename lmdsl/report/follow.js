@@ -2,6 +2,7 @@
 // Follows the map that a page holds, under the table of controls: no pictures here, no document.
 
 const EDGE = 1e-9, MOST_TURNS = 2 ** 20, MOST_PARTS = 1000;
+const PATIENCE = 600;  // milliseconds for a run, or for the samples of a cell
 const ATTRACTOR = 0, STABILIZED = 1, AVOID = 5;
 
 const OPERATIONS = {
@@ -248,8 +249,9 @@ class Follower {
       ? this.map.gamma * (this.map.discount || 1) : 1;
     let x = this.cells.state(start, this.cells.clip), cell = this.cells.cell(x);
     const run = { states: [x], drawn: [x], controls: [], cost: 0, outcome: this.ending(cell) };
+    const until = Date.now() + PATIENCE;
     let power = 1;
-    while (run.outcome === null && run.controls.length < steps) {
+    while (run.outcome === null && run.controls.length < steps && Date.now() < until) {
       const u = this.control(cell);
       if (u === null) { run.outcome = "entered a cell without a control law"; break; }
       run.controls.push(u);
@@ -274,7 +276,7 @@ class Follower {
     return run;
   }
 
-  // Where the samples of a cell go: [{ x, cell, share }].
+  // Where the samples of a cell go, those that there is time for: [{ x, cell, share }].
   samples(cell, offsets, nodes) {
     const u = this.control(cell), found = [];
     if (u === null) return found;
@@ -288,13 +290,15 @@ class Follower {
     }
     const d = this.names.length, q = this.map.noise.length, index = this.cells.index(cell);
     const many = q ? nodes.length / q : 1, count = offsets.length / d;
-    for (let i = 0; i < count; i++) {
+    const until = Date.now() + PATIENCE;
+    for (let i = 0; i < count && Date.now() < until; i++) {
       const x = this.cells.place(index, offsets.subarray(i * d, i * d + d));
       for (let j = 0; j < many; j++) {
         const moved = this.step(x, u, Array.from(nodes.subarray(j * q, j * q + q)));
-        found.push({ x: moved.x, cell: moved.cell, share: 1 / (count * many) });
+        found.push({ x: moved.x, cell: moved.cell });
       }
     }
+    for (const sample of found) sample.share = 1 / found.length;
     return found;
   }
 }

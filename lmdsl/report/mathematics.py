@@ -93,7 +93,7 @@ def equation(left: str, right: str, sign: str = "=") -> str:
 
 def table(rows: Sequence[str]) -> str:
     """Return equations below each other."""
-    return block(f"<mtable>{''.join(rows)}</mtable>")
+    return block(f'<mtable displaystyle="true">{"".join(rows)}</mtable>')
 
 
 def point(names: Sequence[str], values: Sequence[float] | Floats) -> str:

@@ -1,7 +1,8 @@
 // Draws what is known of the cells, by plotly.js.
 
 const DASHES = ["solid", "dash", "dot", "dashdot", "longdash", "longdashdot"];
-const PALETTES = { value: "Viridis", lower: "Viridis", measure: "Cividis" };
+// Palettes that are lighter the larger a value is, so that they are read without colour too.
+const PALETTES = { value: "Viridis", lower: "Viridis", above: "Viridis", below: "Viridis" };
 const SIDE = 36;  // marks of a hatch along an axis, at most
 
 function theme() {
@@ -117,9 +118,10 @@ function regionTraces(slice) {
     zmax: n - 0.5, colorscale: scale, showscale: false, hoverinfo: "none" }];
   for (const region of slice.said.regions.filter(({ mark }) => mark)) {
     const marks = hatch(slice, codes.indexOf(region.code), z);
+    const ink = region.light < 0.5 ? t.paper : t.faint;
     traces.push({ type: "scatter", mode: "markers", x: marks.map((p) => p[0]), yaxis: y,
-      y: marks.map((p) => p[1]), hoverinfo: "skip", marker: { symbol: region.mark, color: t.faint,
-        size: region.mark === "circle" ? 2.5 : 6, line: { width: 1, color: t.faint } } });
+      y: marks.map((p) => p[1]), hoverinfo: "skip", marker: { symbol: region.mark, color: ink, size: region.mark === "circle" ? 2.5 : 6,
+        line: { width: 1, color: ink } } });
   }
   return traces;
 }
@@ -183,7 +185,7 @@ function valueTraces(slice, layer, values) {
   }
   return [{ type: "heatmap", x: slice.x(), y: slice.y(), z, hoverinfo: "none", zmin: ends[0],
     zmax: ends[1] > ends[0] ? ends[1] : ends[0] + 1, colorbar: bar,
-    colorscale: PALETTES[layer.key] || (layer.level ? "Portland" : "Cividis") }];
+    colorscale: PALETTES[layer.key] || "Cividis" }];
 }
 
 // Lines between successive states, broken where a periodic axis wraps.
@@ -230,7 +232,7 @@ function drawMap(slice, layer, ground, runs, smooth) {
     xaxis: { title: { text: axes[a].name }, range: [axes[a].low, axes[a].high], showgrid: false,
       zeroline: false }, uirevision: slice.view.axes.join() };
   if (slice.flat) {
-    shape.yaxis = { title: { text: layer.title }, overlaying: "y2",
+    shape.yaxis = { title: { text: layer.title }, overlaying: "y2", tickmode: "auto",
       type: layer.log ? "log" : "linear", rangemode: "tozero" };
     shape.yaxis2 = { range: [0, 1], visible: false, fixedrange: true };
   } else {
@@ -265,7 +267,7 @@ class Overlay {
       const of = (tag) => document.createElementNS("http://www.w3.org/2000/svg", tag);
       const mark = of(kind === "diamond" ? "path" : kind === "dot" ? "circle" : "rect");
       mark.setAttribute("class", kind);
-      if (kind === "cell") {
+      if (kind.startsWith("cell")) {
         const [left, right, low, high] = [across(x[0]), across(x[1]), up(y[0]), up(y[1])];
         Object.entries({ x: left, y: high, width: Math.max(right - left, 2),
           height: Math.max(low - high, 2) }).forEach(([k, v]) => mark.setAttribute(k, v));
@@ -285,7 +287,8 @@ function pickedMarks(slice, picked) {
   if (!picked) return [];
   const [a, b] = slice.view.axes, box = slice.cells.axes, i = picked.index;
   const side = (k) => [box[k].low + i[k] * box[k].width, box[k].low + (i[k] + 1) * box[k].width];
-  return [["cell", side(a), slice.flat ? [0, 1] : side(b)],
+  const up = slice.flat ? [0, 1] : side(b);
+  return [["cell casing", side(a), up], ["cell", side(a), up],
     ...picked.samples.filter((s) => s.x && s.x.every(Number.isFinite)).map((s) =>
-      ["diamond", s.x[a], slice.flat ? 0.5 : s.x[b], 3 + 5 * Math.sqrt(s.share)])];
+      ["diamond", s.x[a], slice.flat ? 0.5 : s.x[b], 4 + 5 * Math.sqrt(s.share)])];
 }

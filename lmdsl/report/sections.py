@@ -249,15 +249,17 @@ def lost(data: PlainData) -> str:
     parts = []
     for cause in found:
         rows = [
-            (str(f"{region['cells']:,}"), text(region["box"]), text(region["why"]))
+            (f"{region['cells']:,}", text(region["box"]), text(region["why"]))
             for region in cause["regions"]
         ]
         if cause["elsewhere"]:
             rows.append((f"{cause['elsewhere']:,}", "elsewhere", ""))
+        known = 3 if any(why for *_, why in rows) else 2
+        head = ("cells", "where", "what stops the middle one")[:known]
+        meaning = cause["meaning"][:1].upper() + cause["meaning"][1:]
         parts.append(
-            f"<h3>{text(cause['name'])}: {cause['cells']:,} cells</h3>"
-            f"<p>{text(cause['meaning'])}.</p>"
-            f"{table(('cells', 'where', 'what stops the middle one'), rows)}"
+            f"<h3>{text(cause['name'])}: {cause['cells']:,} cells</h3><p>{text(meaning)}.</p>"
+            f"{table(head, [row[:known] for row in rows])}"
         )
     return "".join(parts) + "<p><code>lmdsl explain</code> says what would help.</p>"
 

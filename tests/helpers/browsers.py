@@ -36,7 +36,7 @@ def chromium(page: Path, *options: str, fragment: str = "") -> str:
     command = [str(CHROMIUM), *OPTIONS, f"--user-data-dir={profile}", *options,
                page.resolve().as_uri() + fragment]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
-    return done.stdout
+    return done.stdout + "".join(re.findall(r"^.*:CONSOLE.*$", done.stderr, re.MULTILINE))
 
 
 def dom(page: Path, fragment: str = "") -> str:

@@ -130,6 +130,20 @@ def test_a_function_is_followed_by_the_rows_of_the_model():
         assert len(run["controls"]) == int(4 * start[0]) == run["cost"]
 
 
+@node
+def test_a_page_does_not_hang(solved):
+    """Runs and samples end when their time is up, whatever a file asks for."""
+    code = """let now = 0;
+    Date.now = () => (now += 200);
+    const o = await f.unpacked(data.samples.offsets), w = await f.unpacked(data.samples.nodes);
+    F.ending = () => null;
+    F.control = () => [0];
+    return [F.run(data.starts[0], 1e9, 1), F.samples(0, o, w).length];"""
+    run, samples = followed(told(solved("standard")), code)
+    assert run["outcome"] is None
+    assert (len(run["controls"]), samples) == (2, 2)
+
+
 def test_many_samples_are_thinned():
     problem = made(standard_map(4, sampling={"kind": "grid", "per_axis": 30}))
     found = samples_of(problem)

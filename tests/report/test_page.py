@@ -176,6 +176,15 @@ def test_the_same_result_has_the_same_page(solved, tmp_path, library):
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
+def test_the_library_is_plotlys_own(solved, tmp_path):
+    pytest.importorskip("plotly")
+    solved("steps").report(tmp_path / "a.html")
+    text = (tmp_path / "a.html").read_text()
+    assert "plotly.js v" in text
+    assert "Licensed under the MIT license" in text
+    assert len(text) < 8e6
+
+
 def test_without_plotly_the_fix_is_named(solved, tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "find_spec", lambda name: None)
     with pytest.raises(MissingDependency) as caught:
