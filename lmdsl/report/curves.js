@@ -32,8 +32,9 @@ function drawLoop(loop, survival) {
       line: { color: t.ink, width: 1 } }, hovertemplate: "%{x:.4f} + %{y:.4f} i<extra></extra>" });
   plot("spectrum", traces, { title: headed("eigenvalues; dashed: proved bound"), xaxis: { range: [-1.1, 1.1], title: { text: "real part" } },
   yaxis: { range: [-1.1, 1.1], scaleanchor: "x", title: { text: "imaginary part" } } });
+  const every = loop.steps.every((step, k) => step === k), shape = every ? "hv" : "linear";
   const curves = [{ type: "scatter", mode: "lines", x: loop.steps, y: loop.left,
-    name: "finite model", line: { color: t.ink, width: 2.2 } }];
+    name: "finite model", line: { shape, color: t.ink, width: 2.2 } }];
   if (survival) {
     curves.push({ type: "scatter", mode: "lines", x: survival.steps, y: survival.left,
       name: "simulated runs", line: { shape: "hv", color: t.link, width: 2, dash: "dash" } });

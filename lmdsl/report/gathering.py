@@ -1,6 +1,6 @@
 """Everything that a page says of a result, as plain data that strict JSON can hold."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -16,7 +16,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import LOST, CellStatus
-from lmdsl.proof.record import Proof
+from lmdsl.proof.record import TARGET, Proof
 from lmdsl.report.browser import map_of, rows_of, samples_of
 from lmdsl.report.cells import cells_of
 from lmdsl.report.claims import claims_of
@@ -45,6 +45,8 @@ class Beside(NamedTuple):
         Where the result was read; empty for one that was just found.
     missing
         Why there is no model, a sentence.
+    made_by
+        The versions that a directory names as those that made it.
     """
 
     lp: StabilizationLP | None = None
@@ -53,6 +55,7 @@ class Beside(NamedTuple):
     verification: Verification | None = None
     directory: str = ""
     missing: str = ""
+    made_by: Mapping[str, str] | None = None
 
 
 class _Attempts:
@@ -186,6 +189,14 @@ def _why(explanation: Explanation, cell: int) -> str:
         return ""
 
 
+def _proving(proof: Proof | None) -> str | None:
+    """Return the options by which a proof comes about again; None without one."""
+    if proof is None:
+        return None
+    target = "" if proof.target == TARGET else f" --target {proof.target!r}"
+    return target + " --bracket" * (proof.maps is not None)
+
+
 def _repeat(result: Result, asked: Beside, seed: int) -> dict[str, Any]:
     """Return how the result and this page come about again."""
     from lmdsl.results.directory.archive import identity, versions
@@ -195,10 +206,10 @@ def _repeat(result: Result, asked: Beside, seed: int) -> dict[str, Any]:
         "backend": result.backend,
         "gamma": result.gamma,
         "proved": None if result.proved is None else result.proved.target,
-        "proof": asked.proof is not None,
-        "bracket": asked.proof is not None and asked.proof.maps is not None,
+        "proof": _proving(asked.proof),
         "digest": digest,
         "versions": versions(),
+        "made_by": dict(asked.made_by or {}),
         "directory": asked.directory,
         "seed": seed,
     }

@@ -11,6 +11,7 @@ from importlib.resources import files
 from typing import Any
 
 from lmdsl.report import sections
+from lmdsl.report.texts import text
 
 # What the script reads; the rest is written out as HTML.
 READ = ("cells", "map", "samples", "rows", "starts", "loop", "survival")
@@ -27,7 +28,7 @@ def page(data: dict[str, Any], library: str) -> str:
     )
     read = {name: data[name] for name in READ}
     held = json.dumps(read, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    title = sections.text(data["problem"]["name"] or "A stabilization problem")
+    title = text(data["problem"]["name"] or "A stabilization problem")
     body = "".join(_section(*part) for part in _parts(data))
     links = "".join(f'<a href="#{key}">{name}</a>' for key, name, _ in _parts(data))
     return (

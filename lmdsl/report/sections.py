@@ -1,13 +1,11 @@
-"""The sections of a page: plain data in, HTML out; every text of a user's is made inert here."""
+"""The sections of a page: plain data in, HTML out; every text of anybody's is made inert."""
 
-import html
 import shlex
-from collections.abc import Iterable, Sequence
 from typing import Any
 
-from lmdsl.errors import printable
 from lmdsl.report.claims import percent
 from lmdsl.report.mathematics import number
+from lmdsl.report.texts import lines, table, text, words
 
 PlainData = dict[str, Any]
 
@@ -22,30 +20,6 @@ STATUS = {
     "solver_failed": ("!", "Solver failed", "the solver gave up or reached its limit"),
     "bad_input": ("!", "Bad input", ""),
 }
-
-
-def text(value: Any) -> str:
-    """Return a text of anybody's as HTML that is nothing but this text."""
-    return html.escape(printable(str(value)))
-
-
-def lines(value: str) -> str:
-    """Return a text of several lines likewise."""
-    return "\n".join(map(text, value.split("\n")))
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
-    """Return a table of cells that are HTML already."""
-    top = "".join(f'<th scope="col">{text(x)}</th>' for x in head)
-    body = "".join(
-        "<tr>" + "".join(f'<td data-head="{text(h)}">{x}</td>' for h, x in
-                         zip(head, row, strict=True)) + "</tr>"
-        for row in rows
-    )  # fmt: skip
-    return (
-        f'<div class="scroll"><table class="{kind}"><thead><tr>{top}</tr></thead>'
-        f"<tbody>{body}</tbody></table></div>"
-    )
 
 
 def _known(value: Any, digits: int = 6) -> str:
@@ -146,6 +120,8 @@ def claims(data: PlainData) -> str:
         f"<p>The certificate speaks of {text(data['scope'])}{assumed}. "
         "<em>Proved</em> is what was checked in arithmetic that is safe from rounding; "
         "<em>evidence</em> is what samples and simulated runs show, which is no proof.</p>"
+        f"<details><summary>Words used on this page</summary><dl class='words'>{words()}</dl>"
+        "</details>"
     )
 
 
@@ -297,10 +273,12 @@ def repeat(data: PlainData) -> str:
         solve += f" --proved {again['proved']!r}"
     commands = [f"{solve} --out {folder}", f"lmdsl verify {folder}",
                 f"lmdsl simulate {folder} --starts 1000 --seed {again['seed']}"]  # fmt: skip
-    if again["proof"]:
-        commands.append(f"lmdsl prove {folder}" + " --bracket" * again["bracket"])
+    if again["proof"] is not None:
+        commands.append(f"lmdsl prove {folder}{again['proof']}")
     commands.append(f"lmdsl report {folder}")
     versions = "; ".join(f"{name} {version}" for name, version in again["versions"].items())
+    before = "; ".join(f"{name} {version}" for name, version in again["made_by"].items())
+    made = f"The result was found with {text(before)}. " if before else ""
     file = data["problem"]["file"]
     held = "<p>The problem is no file, or a long one; it is not part of this page.</p>"
     if file is not None:
@@ -310,5 +288,5 @@ def repeat(data: PlainData) -> str:
     left = f"<p>Left out of this page:</p><ul>{notes}</ul>" if notes else ""
     return (
         f"<pre>{lines(chr(10).join(commands))}</pre>{held}{digest if again['digest'] else ''}"
-        f"<p>Written with {text(versions)}; model as above, seed {again['seed']}.</p>{left}"
+        f"<p>{made}This page was written with {text(versions)}; seed {again['seed']}.</p>{left}"
     )

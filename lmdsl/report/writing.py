@@ -98,7 +98,8 @@ def write_directory(
             result.problem if lp is None else lp, backends, time_limit=time_limit,
             progress=progress,
         )  # fmt: skip
-    asked = Beside(lp, proof, comparison, found, str(directory), missing)
+    made_by = stored.certificate.versions
+    asked = Beside(lp, proof, comparison, found, str(directory), missing, made_by)
     _write(result, target, asked, inputs.seed(seed), progress)
     return target, found
 
