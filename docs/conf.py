@@ -35,7 +35,7 @@ autodoc_member_order = "bysource"
 napoleon_use_ivar = True
 napoleon_use_rtype = False
 
-MODULES = ("plotting", "exports", "backends", "systems", "testing")
+MODULES = ("plotting", "exports", "interop", "backends", "systems", "testing")
 
 
 # Navigation ------------------------------------------------------------------------------------
