@@ -102,14 +102,15 @@ class Match:
         self.problem, self.box = problem, box
         self.partition = partition = Partition.of(problem)
         self.chosen = Chosen(partition, control_vectors(problem))
-        sets = CellSets.of(problem, partition)
         self.status = np.full(partition.size, CellStatus.STABILIZED, dtype=np.uint8)
-        self.status[sets.attractor] = CellStatus.ATTRACTOR
-        self.status[sets.avoid] = CellStatus.AVOID
-        if isinstance(source, Result):
-            self.status[source.cell_status == CellStatus.ATTRACTOR] = CellStatus.ATTRACTOR
+        if isinstance(source, Result):  # whose attractor may be what holds of the declared one
+            kept = np.isin(source.cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID))
+            self.status[kept] = source.cell_status[kept]
             self.start, weight = np.flatnonzero(source.weight), source.weight
         else:
+            sets = CellSets.of(problem, partition)
+            self.status[sets.attractor] = CellStatus.ATTRACTOR
+            self.status[sets.avoid] = CellStatus.AVOID
             self.start, weight = sets.free, sets.mass
         self.start = self.start[weight[self.start] > 0]
         if not len(self.start):

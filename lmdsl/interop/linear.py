@@ -23,7 +23,8 @@ def state_space(problem: Problem, state: ArrayLike, control: ArrayLike | None = 
     Parameters
     ----------
     problem
-        Its system, but for finite models; noise is at its mean.
+        Its system, but for finite models; noise is at its mean. Of ``auto`` substeps, which solving
+        settles, there are 16 here; take ``result.problem`` for those that were chosen.
     state
         The fixed point, shape (d,), or by name.
     control

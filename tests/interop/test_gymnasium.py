@@ -78,6 +78,50 @@ def test_returns_of_deterministic_steps_are_the_certified_costs():
         assert total == pytest.approx(result.value[cell], rel=1e-12)
 
 
+def test_many_are_played_at_a_time():
+    """Gymnasium's vectors of environments; and copies, as other processes get them."""
+    cloudpickle = pytest.importorskip("cloudpickle")
+    result = lm.solve(made(standard_map(20)))
+    env, play = lm.interop.gym_env(result), lm.interop.policy(result)
+    copy = cloudpickle.loads(cloudpickle.dumps(env))
+    for each in (env, copy):
+        each.reset(seed=5)
+    for _ in range(3):
+        (x, *one), (y, *other) = env.step(3), copy.step(3)
+        np.testing.assert_array_equal(x, y)
+        assert one[:3] == other[:3]
+        if one[1]:
+            break
+    many = gymnasium.vector.SyncVectorEnv([lambda: lm.interop.gym_env(result)] * 3)
+    x, _ = many.reset(seed=[0, 1, 2])
+    actions = play(x)
+    assert actions.shape == (3,)
+    x, reward, *_ = many.step(actions)
+    for seed in range(3):
+        start, _ = env.reset(seed=seed)
+        alone, paid, *_ = env.step(play(start))
+        np.testing.assert_array_equal(x[seed], alone)
+        assert reward[seed] == paid
+
+
+def test_what_holds_of_an_attractor_is_the_goal():
+    """Of a result that holds, runs end on the cells that hold, not on all declared ones."""
+    data = steps(
+        attractor={"cells": [[0], [2]]}, local_controller={"kind": "hold"},
+        system={"kind": "map", "next": {"x": "where(x < 0.25, x, x - 0.25)"}},
+        control_grid={},
+    )  # fmt: skip
+    result = lm.solve(made(data))
+    assert result.cell_status.tolist() == [0, 1, 1, 1]
+    env = lm.interop.gym_env(result)
+    env.reset(options={"state": [0.9]})
+    outcomes = [env.step(0)[4]["outcome"] for _ in range(3)]
+    assert outcomes == ["running", "running", "reached"]
+    declared = lm.interop.gym_env(made(data))
+    declared.reset(options={"state": [0.9]})
+    assert declared.step(0)[4]["outcome"] == "reached"
+
+
 def test_finite_models_are_played_by_their_rows():
     problem = lm.from_matrices(**TABLE)
     env = lm.interop.gym_env(problem)

@@ -1,5 +1,8 @@
 """The controller as a C header: compiled, it gives what Python gives, to the same bits."""
 
+import shutil
+import subprocess
+
 import numpy as np
 import pytest
 from c_controller import COMPILER, CompiledController, states
@@ -54,6 +57,16 @@ def test_it_is_the_controller_to_the_same_bits(result, tmp_path):
     plain = (index >= 0) & (index < len(result.control_vectors))
     np.testing.assert_array_equal(u[plain], result.control_vectors[index[plain]])
     assert (index == len(result.control_vectors)).any() == (result.controller.local is not None)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler")
+def test_a_compiler_of_cpp_takes_it(result, tmp_path):
+    lm.exports.export_c(result, tmp_path / "controller.h")
+    (tmp_path / "main.cpp").write_text(
+        '#include "controller.h"\nint f(double *x, double *u) { return lmdsl_control(x, u); }\n'
+    )
+    strict = ["-std=c++17", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsyntax-only"]
+    subprocess.run(["g++", *strict, tmp_path / "main.cpp"], check=True)
 
 
 @needs_compiler
