@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from lmdsl.advice.report import Finding as Finding
     from lmdsl.advice.studies.record import Study as Study
     from lmdsl.advice.studies.running import study as study
+    from lmdsl.advice.suggesting.report import Suggestion as Suggestion
+    from lmdsl.advice.suggesting.search import suggest as suggest
     from lmdsl.certificate.claims import Certificate as Certificate
     from lmdsl.control.controller import Controller as Controller
     from lmdsl.control.simulation import Simulation as Simulation
@@ -71,6 +73,7 @@ _HOME = {
     "Simulation": "control.simulation",
     "StabilizationLP": "model.lp",
     "Study": "advice.studies.record",
+    "Suggestion": "advice.suggesting.report",
     "TimeLimitReached": "machine.deadline",
     "Verification": "results.verification",
     "check": "advice.checking",
@@ -84,6 +87,7 @@ _HOME = {
     "read_data": "data.tables",
     "solve": "results.solving",
     "study": "advice.studies.running",
+    "suggest": "advice.suggesting.search",
     "verify": "results.verification",
 }
 _PACKAGES = {name: name for name in ("backends", "interop", "plotting", "systems", "testing")}

@@ -75,7 +75,7 @@ def levels(problem: Problem, deadline: Deadline) -> list[Level]:
             name: max(round(axis.cells * 2.0**power), 1) for name, axis in bare.state_box.items()
         }
         own = power == 0
-        other = bare if own else _without_indices(bare)
+        other = bare if own else without_indices(bare)
         if other is None or max(cells.values()) > 2**30:
             continue
         scaled = bare if own else remedies.with_cells(other, cells)
@@ -106,7 +106,7 @@ def _compiled(problem: Problem, cells: dict[str, int], deadline: Deadline) -> Le
     return Level(problem, cells, covered, time.perf_counter() - start)
 
 
-def _without_indices(problem: Problem) -> Problem | None:
+def without_indices(problem: Problem) -> Problem | None:
     """Return a problem whose attractor is not of indices of cells; None where it is too large."""
     if not problem.attractor.cells:
         return problem

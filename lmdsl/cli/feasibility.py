@@ -10,12 +10,18 @@ from lmdsl.cli.output import (
     shared,
 )
 from lmdsl.cli.streams import say
+from lmdsl.errors import BadInput
 
 
 def add(command: Command) -> None:
     """Add the commands of this module."""
     check = command("check", _check, "Say what looks wrong with a problem before the long run.")
-    shared(check, "file", "--time-limit", "--json")
+    shared(check, "file")
+    check.add_argument("--suggest", action="store_true",
+                       help="try step, cells and samples that fit each other")  # fmt: skip
+    check.add_argument("--out", metavar="FILE",
+                       help="write the problem with what is suggested to FILE")  # fmt: skip
+    shared(check, "--time-limit", "--json")
 
     limit = command("gamma-max", _gamma_max, "Enclose the largest feasible gamma.")
     shared(limit, "file", "--time-limit")
@@ -33,12 +39,26 @@ def add(command: Command) -> None:
 
 def _check(parsed: Arguments) -> int:
     from lmdsl.advice.checking import check
+    from lmdsl.common.records import jsonable
+    from lmdsl.machine.deadline import Deadline
 
-    problem = problem_at(parsed.file)
+    if parsed.out is not None and not parsed.suggest:
+        raise BadInput("there is nothing to write without --suggest", "--out")
+    problem, better = problem_at(parsed.file), None
+    deadline = Deadline.of(parsed.time_limit)
     with ProgressLine() as progress:
-        found = check(problem, time_limit=parsed.time_limit, progress=progress)
-    answer(parsed, found)
-    return int(bool(found))
+        found = check(problem, time_limit=Deadline(deadline.left), progress=progress)
+        if parsed.suggest:
+            from lmdsl.advice.suggesting.search import suggest
+
+            better = suggest(problem, time_limit=Deadline(deadline.left), progress=progress)
+    if parsed.json:
+        print_json({**found.to_dict(), "suggestion": jsonable(better)})
+    else:
+        say(f"{found}\n\n{better}" if better else str(found))
+    if better and parsed.out is not None:
+        better.problem.save(parsed.out)
+    return int(bool(found) or bool(better and better.better))
 
 
 def _gamma_max(parsed: Arguments) -> int:

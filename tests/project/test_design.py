@@ -34,10 +34,10 @@ FORWARDING = {
 PUBLIC = [
     "Area", "BadInput", "CellStatus", "Certificate", "CheckReport", "Comparison", "Controller",
     "Explanation", "Finding", "GammaBar", "LmdslError", "PhaseOne", "Problem", "Region", "Result",
-    "Simulation", "StabilizationLP", "Study", "TimeLimitReached", "Verification", "__version__",
-    "backends", "check", "compare", "compile", "explain", "exports", "from_data",
+    "Simulation", "StabilizationLP", "Study", "Suggestion", "TimeLimitReached", "Verification",
+    "__version__", "backends", "check", "compare", "compile", "explain", "exports", "from_data",
     "from_matrices", "gamma_max", "interop", "load", "plotting", "read_data", "solve", "study",
-    "systems", "testing", "verify",
+    "suggest", "systems", "testing", "verify",
 ]  # fmt: skip
 
 

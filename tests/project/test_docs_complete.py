@@ -164,7 +164,8 @@ def test_every_public_name_is_described():
 
 
 @pytest.mark.parametrize(
-    "name", ["solve", "compare", "compile", "explain", "gamma_max", "load", "study", "verify"]
+    "name",
+    ["solve", "compare", "compile", "explain", "gamma_max", "load", "study", "suggest", "verify"],
 )
 def test_signatures_are_as_described(name):
     check_signature(f"lm.{name}", getattr(lm, name))
