@@ -159,7 +159,7 @@ def test_points_on_edges_keep_their_two_cells():
 def test_stretching_keeps_the_number_of_cells(seed):
     rng = np.random.default_rng(seed)
     aim = tuple(rng.uniform(8, 64, rng.integers(2, 5)))
-    choice = choices.Choice(0.1, aim, None)
+    choice = choices.Combination(0.1, aim, None)
     k = int(rng.integers(len(aim)))
     other = choice.stretched(k, 2.0)
     assert math.prod(other.aim) == pytest.approx(math.prod(aim))

@@ -22,7 +22,7 @@ FEW_SAMPLES, TIMES = 16, 3
 GRIDS, CORNERS = range(1, 5), 32  # grids tried; corners up to which a cell's are sampled
 
 
-class Choice(NamedTuple):
+class Combination(NamedTuple):
     """A step, cells and samples.
 
     Attributes
@@ -55,17 +55,17 @@ class Choice(NamedTuple):
             aim = tuple(max(0.97 * a, 1.0) for a in aim)
         return found
 
-    def stretched(self, axis: int, factor: float) -> "Choice":
+    def stretched(self, axis: int, factor: float) -> "Combination":
         """Return more cells on an axis and fewer on the others, as many in all."""
         others = factor ** (-1 / (len(self.aim) - 1))
         aim = tuple(n * (factor if k == axis else others) for k, n in enumerate(self.aim))
         return self._replace(aim=tuple(max(n, 1.0) for n in aim))
 
-    def rounded(self) -> "Choice":
+    def rounded(self) -> "Combination":
         """Return the same with a step of few digits."""
         return self._replace(step=None if self.step is None else float(f"{self.step:.3g}"))
 
-    def scaled(self, factor: float) -> "Choice":
+    def scaled(self, factor: float) -> "Combination":
         """Return so many times the cells on each axis, and a step that fits them.
 
         In a step a run moves h f, and errs by about a width w: w/(h f) of it. Images of a cell
@@ -75,10 +75,10 @@ class Choice(NamedTuple):
         return self._replace(step=step, aim=tuple(n * factor for n in self.aim))
 
 
-def own(problem: Problem) -> Choice:
+def own(problem: Problem) -> Combination:
     """Return what a problem declares itself."""
     aim = tuple(float(axis.cells) for axis in problem.state_box.values())
-    return Choice(getattr(problem.system, "step", None), aim, problem.sampling)
+    return Combination(getattr(problem.system, "step", None), aim, problem.sampling)
 
 
 def count(problem: Problem, name: str, aim: float) -> int:
@@ -145,7 +145,7 @@ def thinned(problem: Problem, most: int) -> Problem:
     return problem.replaced(control_grid=changed)
 
 
-def moves(problem: Problem, radius: float) -> Iterator[Callable[[Choice], Choice]]:
+def moves(problem: Problem, radius: float) -> Iterator[Callable[[Combination], Combination]]:
     """Yield functions from a choice to another one: steps, then cells, then samples."""
     factor = 2.0**radius
     if own(problem).step is not None:
@@ -154,14 +154,14 @@ def moves(problem: Problem, radius: float) -> Iterator[Callable[[Choice], Choice
     d = len(problem.states)
     for k in range(d if d > 1 else 0):
         for by in (factor, 1 / factor):
-            yield partial(Choice.stretched, axis=k, factor=by)
+            yield partial(Combination.stretched, axis=k, factor=by)
     for sampling in samplings(problem):
         yield partial(_sampled, sampling=sampling)
 
 
-def _longer(choice: Choice, by: float) -> Choice:
+def _longer(choice: Combination, by: float) -> Combination:
     return choice._replace(step=None if choice.step is None else choice.step * by)
 
 
-def _sampled(choice: Choice, sampling: Any) -> Choice:
+def _sampled(choice: Combination, sampling: Any) -> Combination:
     return choice._replace(sampling=sampling)

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from lmdsl.advice.suggesting.choices import Choice
+from lmdsl.advice.suggesting.choices import Combination
 from lmdsl.common.records import Reported
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline
@@ -19,7 +19,7 @@ LONGER, LEAST_STEPS, MOST_STEPS = 10, 200, 2_000
 
 
 @dataclass(frozen=True)
-class Pilot(Reported):
+class Attempt(Reported):
     """What became of a choice.
 
     Attributes
@@ -70,7 +70,9 @@ def sampling_words(sampling: dict[str, Any]) -> str:
     return f"{sampling['points']} {sampling['kind']} points{corners}"
 
 
-def tried(problem: Problem, choice: Choice, deadline: Deadline, accurate: bool = False) -> Pilot:
+def tried(
+    problem: Problem, choice: Combination, deadline: Deadline, accurate: bool = False
+) -> Attempt:
     """Try a choice; runs are those of the compiled steps, or ``accurate`` ones.
 
     Raises
@@ -84,7 +86,7 @@ def tried(problem: Problem, choice: Choice, deadline: Deadline, accurate: bool =
     except BadInput as error:
         cells = {name: round(n) for name, n in zip(problem.states, choice.aim, strict=True)}
         sampling = problem.replaced(sampling=choice.sampling).sampling
-        return Pilot(choice.step, cells, plain(sampling), None, None, 0.0, str(error))
+        return Attempt(choice.step, cells, plain(sampling), None, None, 0.0, str(error))
     known = (
         choice.step,
         {name: axis.cells for name, axis in changed.state_box.items()},
@@ -94,16 +96,16 @@ def tried(problem: Problem, choice: Choice, deadline: Deadline, accurate: bool =
         result = solve(changed, time_limit=Deadline(deadline.left))
         deadline.raise_if_over("trying")
     except BadInput as error:
-        return Pilot(*known, None, None, 0.0, str(error))
+        return Attempt(*known, None, None, 0.0, str(error))
     coverage = result.coverage.share if result.coverage is not None else None
     if (result.control_index < 0).all() or not coverage:
-        return Pilot(*known, coverage, None, 0.0, result.message)
+        return Attempt(*known, coverage, None, 0.0, result.message)
     assert result.lp is not None
     longest = int(result.lp.tree[0].max(initial=1))
     steps = min(max(LONGER * longest, LEAST_STEPS), MOST_STEPS)
     runs = result.simulate(STARTS, steps, as_compiled=not accurate)
     kept = (runs.reached if runs.aimed else runs.cycling) / runs.starts
-    return Pilot(*known, coverage, kept, score(result, kept))
+    return Attempt(*known, coverage, kept, score(result, kept))
 
 
 def plain(sampling: Any) -> dict[str, Any]:
@@ -115,7 +117,7 @@ def plain(sampling: Any) -> dict[str, Any]:
 
 
 def score(result: Result, arrives: float) -> float:
-    """Return how well a result serves; see :class:`Pilot`."""
+    """Return how well a result serves; see :class:`Attempt`."""
     status = result.cell_status
     whole = len(status) - int((status == CellStatus.AVOID).sum())
     attractor = int((status == CellStatus.ATTRACTOR).sum())

@@ -4,7 +4,7 @@ import json
 from dataclasses import dataclass, fields
 from typing import Any
 
-from lmdsl.advice.suggesting.pilots import Pilot, plain
+from lmdsl.advice.suggesting.pilots import Attempt, plain
 from lmdsl.common.records import Reported, jsonable
 from lmdsl.problem.problem import Problem
 
@@ -38,11 +38,11 @@ class Suggestion(Reported):
     problem: Problem
     better: bool
     changes: dict[str, Any]
-    before: Pilot
-    after: Pilot
+    before: Attempt
+    after: Attempt
     whole: bool
     reasons: tuple[str, ...]
-    pilots: tuple[Pilot, ...]
+    pilots: tuple[Attempt, ...]
     cut: bool = False
 
     def to_dict(self) -> dict[str, Any]:

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 from lmdsl.advice import sizes
 from lmdsl.advice.suggesting import choices
-from lmdsl.advice.suggesting.choices import Choice
-from lmdsl.advice.suggesting.pilots import Pilot, sampling_words, tried
+from lmdsl.advice.suggesting.choices import Combination
+from lmdsl.advice.suggesting.pilots import Attempt, sampling_words, tried
 from lmdsl.advice.suggesting.report import Suggestion, changes
 from lmdsl.common import inputs
 from lmdsl.common.types import Progress
@@ -41,8 +41,8 @@ SURE = 0.9  # share that arrives from which on a trial is told where the best on
 class Best(NamedTuple):
     """The best choice so far, and what became of it."""
 
-    choice: Choice
-    pilot: Pilot
+    choice: Combination
+    pilot: Attempt
 
 
 class _Trials:
@@ -50,10 +50,10 @@ class _Trials:
 
     def __init__(self, problem: Problem, deadline: Deadline, progress: Progress | None) -> None:
         self.problem, self.deadline, self.progress = problem, deadline, progress
-        self.known: dict[str, Pilot] = {}
+        self.known: dict[str, Attempt] = {}
         self.cut = False
 
-    def __call__(self, choice: Choice) -> Pilot | None:
+    def __call__(self, choice: Combination) -> Attempt | None:
         """Return what becomes of a choice; None where no more trials are made."""
         key = str((choice.step, choice.cells(self.problem), choice.sampling))
         if key in self.known:
@@ -145,7 +145,7 @@ def _affordable(problem: Problem) -> float:
 def _searched(trials: _Trials, best: Best) -> Best:
     """Return the best choice that is found."""
 
-    def better(choice: Choice) -> bool:
+    def better(choice: Combination) -> bool:
         nonlocal best
         if best.pilot.score > ENOUGH:
             return False
@@ -179,7 +179,7 @@ def _decided(
     base: Problem,
     trials: _Trials,
     best: Best,
-    start: Choice,
+    start: Combination,
     factor: float,
     deadline: Deadline,
 ) -> Suggestion:
@@ -219,7 +219,7 @@ def _cheap(problem: Problem) -> bool:
     return sizes.work(problem) <= WHOLE and memory.fits(estimates.estimate(problem))
 
 
-def _written(problem: Problem, base: Problem, choice: Choice) -> Problem:
+def _written(problem: Problem, base: Problem, choice: Combination) -> Problem:
     """Return the problem with a choice."""
     kept = problem.measure
     if kept is not None and kept.weights is not None:
@@ -228,14 +228,14 @@ def _written(problem: Problem, base: Problem, choice: Choice) -> Problem:
     return choice.of(own)
 
 
-def _reasons(problem: Problem, pilots: list[Pilot], best: Best, changed: Problem) -> list[str]:
+def _reasons(problem: Problem, pilots: list[Attempt], best: Best, changed: Problem) -> list[str]:
     """Return why each part is as it is: what becomes of its neighbours."""
     pilot = best.pilot
     found = [
         "trials are judged by the share of the box that is stabilizable times the square of the "
         "share of its runs on the true map that arrive"
     ]
-    parts: list[tuple[str, Any, Callable[[Pilot], str]]] = [
+    parts: list[tuple[str, Any, Callable[[Attempt], str]]] = [
         ("step", pilot.step, lambda p: f"a step of {p.step:.3g}"),
         ("cells", pilot.cells, lambda p: f"cells {'x'.join(map(str, p.cells.values()))}"),
         ("sampling", pilot.sampling, lambda p: sampling_words(p.sampling)),
@@ -265,7 +265,7 @@ def _reasons(problem: Problem, pilots: list[Pilot], best: Best, changed: Problem
     return found
 
 
-def _became(pilot: Pilot) -> str:
+def _became(pilot: Attempt) -> str:
     if pilot.coverage is None or pilot.arrives is None:
         return "nothing can be stabilized" if pilot.coverage is not None else "no such problem"
     return f"coverage {100 * pilot.coverage:.3g} %, {100 * pilot.arrives:.3g} % arrive"
