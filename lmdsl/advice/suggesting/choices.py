@@ -11,8 +11,8 @@ from lmdsl.explanation.remedies import with_cells
 from lmdsl.explanation.trials import some
 from lmdsl.model.grid.axis import EDGE
 from lmdsl.problem.axes import Axis
-from lmdsl.problem.changing import with_step
 from lmdsl.problem.problem import Problem
+from lmdsl.problem.whole.changing import with_step
 
 NEAR = math.log(4 / 3)  # how far, in logarithms, from what is aimed at a number of cells may be
 FAR = 0.5  # what that distance counts beside the part of the attractor that is lost
