@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl.certificate.claims import Certificate, Witness
+from lmdsl.certificate.exact_sums import BLOCK
 from lmdsl.certificate.judge import exact_verdict, verdict
 from lmdsl.common import inputs
 from lmdsl.common.records import jsonable
@@ -19,6 +20,7 @@ from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, printable
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.progress import Counted
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.assembly.estimates import estimate
 from lmdsl.model.assembly.transitions import shares_of
@@ -145,8 +147,9 @@ def verify(
     ]
     lp = whole = recompiled(path, result, progress, deadline)
     in_time()
-    if progress:
-        progress("verify", -1.0)
+    if progress:  # told at once, and where an exact judge reads blocks of rows
+        counted = Counted(in_time, progress, -(-lp.n // BLOCK) - (-lp.K // BLOCK))
+        judge = partial(exact_verdict, guard=counted) if exact else judge
     if result.problem.functions:
         reasons += function_differences(lp, result)
         notes = function_notes(result) + notes

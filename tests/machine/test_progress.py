@@ -184,7 +184,7 @@ def test_long_work_is_announced_once(monkeypatch, caplog):
     clock = Clock()
     monkeypatch.setattr(estimates.time, "perf_counter", clock)
     with caplog.at_level(logging.INFO, "lmdsl"):
-        long = estimates.Outlook(3.1e9, 1e8)
+        long = estimates.Outlook("compiling and solving take", 3.1e9, 1e8)
         for fraction in (0.001, 0.002, 0.004, 0.5, 1.0):
             long.done(fraction)
             clock.now += 0.6
@@ -194,7 +194,14 @@ def test_long_work_is_announced_once(monkeypatch, caplog):
     ]
     caplog.clear()
     with caplog.at_level(logging.INFO, "lmdsl"):
-        short = estimates.Outlook(3.1e9, 1e7)
+        apart = estimates.Outlook("enclosing takes")
+        for fraction in (0.01, 0.02, 0.03):
+            apart.done(fraction)
+            clock.now += 1
+    assert [r.getMessage() for r in caplog.records] == ["enclosing takes about 2 min"]
+    caplog.clear()
+    with caplog.at_level(logging.INFO, "lmdsl"):
+        short = estimates.Outlook("compiling and solving take", 3.1e9, 1e7)
         for fraction in (0.1, 0.2, 0.6, 1.0):
             short.done(fraction)
             clock.now += 2
@@ -207,6 +214,22 @@ def test_the_announcement_is_made_while_compiling(monkeypatch, caplog):
     with caplog.at_level(logging.INFO, "lmdsl"):
         lm.compile(made(standard_map(100)))
     assert sum("compiling and solving take about" in r.getMessage() for r in caplog.records) == 1
+
+
+def test_an_exact_judge_tells_how_far_it_is(tmp_path, monkeypatch):
+    from lmdsl.certificate import exact_sums
+    from lmdsl.results import verification
+
+    for module in (exact_sums, verification):
+        monkeypatch.setattr(module, "BLOCK", 64)
+    lm.solve(made(standard_map(20))).save(tmp_path / "out")
+    told = []
+    assert lm.verify(tmp_path / "out", exact=True, progress=lambda *what: told.append(what)).holds
+    fractions = [fraction for stage, fraction in told if stage == "verify"]
+    assert fractions[0] == -1
+    assert len(fractions) > 100
+    assert fractions[1:] == sorted(fractions[1:])
+    assert fractions[-1] == 1
 
 
 def test_times_are_spoken():

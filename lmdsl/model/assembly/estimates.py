@@ -120,19 +120,21 @@ class Outlook:
 
     Parameters
     ----------
+    what
+        What is done, in words.
     need
-        Bytes that they take.
+        Bytes that it takes, None where that was said already.
     entries
-        Number of transitions, about.
+        Number of transitions that are solved, about.
     """
 
-    def __init__(self, need: float, entries: float) -> None:
-        self.need, self.entries = need, entries
+    def __init__(self, what: str, need: float | None = None, entries: float = 0.0) -> None:
+        self.what, self.need, self.entries = what, need, entries
         self.begun: tuple[float, float] | None = None
         self.told = False
 
     def done(self, fraction: float) -> None:
-        """Note that part of the sampling is done."""
+        """Note which part is done of what has to be done first."""
         now = time.perf_counter()
         if self.begun is None:  # kernels were compiled on the way here
             self.begun = now, fraction
@@ -143,8 +145,8 @@ class Outlook:
         self.told = True
         seconds = (now - began) * (1 - first) / (fraction - first) + SOLVING * self.entries
         if seconds > LONG:
-            what = f"about {spoken(seconds)}, {memory.human(self.need)}"
-            log.info("compiling and solving take %s", what)
+            room = "" if self.need is None else f", {memory.human(self.need)}"
+            log.info("%s about %s%s", self.what, spoken(seconds), room)
 
 
 def work(problem: Problem) -> float:

@@ -109,7 +109,7 @@ def _assembled(
     code = _Growing(code_type(len(shares.numerator)), capacity)
     pair_pointer = np.zeros(F + 1, dtype=np.int64)
     pointer.append(np.zeros(1, dtype=np.int64))
-    done, outlook = 0, Outlook(need, pairs * pilot.entries)
+    done, outlook = 0, Outlook("compiling and solving take", need, pairs * pilot.entries)
     # glibc returns the memory of a block to the system, to fault it in again for the next one,
     # unless it has seen more than that freed at once.
     np.empty(2**20)

@@ -15,6 +15,7 @@ from lmdsl.common.types import Bools, Guard, Indices, Progress
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.asked import Asked
+from lmdsl.model.assembly.estimates import Outlook
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors import counting
@@ -116,8 +117,10 @@ def enclosed(
                 found.out[some] |= ~admitted.reshape(-1)[_offset(admitted.shape[:-1], at)]
 
     asked = Asked(grid.encloser.true_map.map)  # a user's function, which threads may not share
+    outlook = Outlook("enclosing the images of whole cells takes")
     with asked.helped():
         for (_, _, end), _ in zip(work, asked.in_order(fill, work, deadline.cancel), strict=True):
+            outlook.done(end / max(count, 1))
             if progress:
                 progress("enclose", end / max(count, 1))
     return found
