@@ -53,7 +53,7 @@ class Page {
 
   start() {
     this.build();
-    this.legend();
+    drawLegend(this.said.regions);
     const asked = new URLSearchParams(location.hash.slice(1)).get("start");
     if (this.follower.able) {
       for (const x of this.data.starts || []) this.follow(x, false);
@@ -65,7 +65,11 @@ class Page {
     }
     this.draw().then(() => this.listen());
     drawLoop(this.data.loop, this.data.survival);
-    const again = () => { this.draw(); drawLoop(this.data.loop, this.data.survival); };
+    const again = () => {
+      this.draw();
+      drawLegend(this.said.regions);
+      drawLoop(this.data.loop, this.data.survival);
+    };
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", again);
     matchMedia("print").addEventListener("change", again);
     document.documentElement.dataset.ready = "yes";
@@ -78,8 +82,8 @@ class Page {
   async draw() {
     const layer = this.said.layers[this.layer], slice = this.slice();
     const key = JSON.stringify([this.layer, this.view, theme().paper]);
-    if (key !== this.key) this.ground = groundTraces(slice, layer, this.layers[this.layer]);
-    this.key = key;
+    if (key !== this.grounded) this.ground = groundTraces(slice, layer, this.layers[this.layer]);
+    this.grounded = key;
     await drawMap(slice, layer, this.ground, this.runs, this.smooth);
     this.mark();
     const last = this.runs[this.runs.length - 1];
@@ -111,7 +115,7 @@ class Page {
     }
     axes.forEach((axis, k) => { if (!this.view.axes.includes(k)) bar.append(this.slider(axis, k)); });
     if (!this.follower.able) return;
-    bar.append(this.button("random start", () => this.follow(this.somewhere(), true)),
+    bar.append(this.button("random start", () => this.watch(this.somewhere())),
       this.button("play", () => this.play()),
       this.button("clear runs", () => { this.runs = []; this.say("run", ""); this.draw(); }));
   }
@@ -151,28 +155,6 @@ class Page {
     return found;
   }
 
-  legend() {
-    const list = document.getElementById("legend"), marks = {
-      "line-ne-open": "M3 13L13 3", "line-nw-open": "M3 3L13 13", circle: "M7 8h2M8 7v2",
-      "x-thin-open": "M3 3L13 13M3 13L13 3", "line-ew-open": "M3 8h10" };
-    for (const region of this.said.regions) {
-      const item = document.createElement("li"), name = "http://www.w3.org/2000/svg";
-      const svg = document.createElementNS(name, "svg"), box = document.createElementNS(name, "rect");
-      const mark = document.createElementNS(name, "path"), t = theme();
-      Object.entries({ width: 16, height: 16, "aria-hidden": "true" })
-        .forEach(([key, value]) => svg.setAttribute(key, value));
-      Object.entries({ x: 1, y: 1, width: 14, height: 14, fill: grey(region.light),
-        stroke: region.code === ATTRACTOR ? t.ink : t.faint,
-        "stroke-width": region.code === ATTRACTOR ? 2 : 1 })
-        .forEach(([key, value]) => box.setAttribute(key, value));
-      mark.setAttribute("d", marks[region.mark] || "");
-      mark.setAttribute("stroke", t.faint);
-      svg.append(box, mark);
-      item.append(svg, `${region.name} (${region.cells.toLocaleString("en")} cells)`);
-      list.append(item);
-    }
-  }
-
   // Cells and runs -----------------------------------------------------------------------------
 
   listen() {
@@ -182,8 +164,31 @@ class Page {
     map.on("plotly_click", (event) => {
       const x = this.at(event);
       this.point(x);
-      if (this.follower.able) this.follow(x, true);
+      this.watch(x);
     });
+    map.addEventListener("keydown", (event) => this.press(event));
+  }
+
+  // Arrows go from cell to cell, Enter starts a run in the middle of one.
+  press(event) {
+    const [a, b] = this.view.axes, turn = { ArrowLeft: [a, -1], ArrowRight: [a, 1],
+      ArrowDown: [b, -1], ArrowUp: [b, 1] }[event.key];
+    const index = this.picked ? [...this.picked.index] : [...this.view.at];
+    if (event.key === "Enter") this.watch(this.cells.centre(this.cells.flat(index)));
+    else if (turn && turn[0] !== undefined) {
+      const [k, by] = turn, n = this.cells.axes[k].cells, step = by * this.said.step;
+      index[k] = this.cells.axes[k].periodic ? (index[k] + step + n) % n
+        : Math.min(Math.max(index[k] + step, 0), n - 1);
+      this.point(this.cells.centre(this.cells.flat(index)));
+    } else return;
+    event.preventDefault();
+  }
+
+  // Follows a run from there, and moves a dot along it unless the reader wants no motion.
+  watch(x) {
+    if (!this.follower.able) return;
+    this.follow(x, true);
+    if (!matchMedia("(prefers-reduced-motion: reduce)").matches) this.play();
   }
 
   // The state under a pointer: where it is exactly, the other axes as they are held.

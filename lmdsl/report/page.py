@@ -37,7 +37,8 @@ def page(data: dict[str, Any], library: str) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark"><meta name="referrer" '
         f'content="no-referrer"><title>{title}</title><style>{_asset("page.css")}</style></head>'
-        f"<body><main>{sections.heading(data)}<nav>{links}</nav>{body}</main>"
+        "<body><noscript><p class='note'>The pictures need JavaScript; everything else does not."
+        f"</p></noscript><main>{sections.heading(data)}<nav>{links}</nav>{body}</main>"
         "<footer>Written by lmdsl.</footer>"
         f'<script type="application/json" id="data">{held}</script>'
         + "".join(f"<script>{script}</script>" for script in scripts)

@@ -292,3 +292,27 @@ function pickedMarks(slice, picked) {
     ...picked.samples.filter((s) => s.x && s.x.every(Number.isFinite)).map((s) =>
       ["diamond", s.x[a], slice.flat ? 0.5 : s.x[b], 4 + 5 * Math.sqrt(s.share)])];
 }
+
+// What the hatches and outlines mean.
+function drawLegend(regions) {
+  const list = document.getElementById("legend"), marks = {
+    "line-ne-open": "M3 13L13 3", "line-nw-open": "M3 3L13 13", circle: "M7 8h2M8 7v2",
+    "x-thin-open": "M3 3L13 13M3 13L13 3", "line-ew-open": "M3 8h10" };
+  list.replaceChildren();
+  for (const region of regions) {
+    const item = document.createElement("li"), name = "http://www.w3.org/2000/svg";
+    const svg = document.createElementNS(name, "svg"), box = document.createElementNS(name, "rect");
+    const mark = document.createElementNS(name, "path"), t = theme();
+    Object.entries({ width: 16, height: 16, "aria-hidden": "true" })
+      .forEach(([key, value]) => svg.setAttribute(key, value));
+    Object.entries({ x: 1, y: 1, width: 14, height: 14, fill: grey(region.light),
+      stroke: region.code === ATTRACTOR ? t.ink : t.faint,
+      "stroke-width": region.code === ATTRACTOR ? 2 : 1 })
+      .forEach(([key, value]) => box.setAttribute(key, value));
+    mark.setAttribute("d", marks[region.mark] || "");
+    mark.setAttribute("stroke", t.faint);
+    svg.append(box, mark);
+    item.append(svg, `${region.name} (${region.cells.toLocaleString("en")} cells)`);
+    list.append(item);
+  }
+}

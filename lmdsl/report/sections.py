@@ -140,12 +140,14 @@ def pictures(data: PlainData) -> str:
     sampled = f" Of every axis one cell in {step} is drawn: the grid is large." if step > 1 else ""
     return (
         '<div id="controls" class="controls"></div><div class="side"><div id="map" class="plot" '
-        'role="img" aria-label="the cells of the state box"></div>'
+        'tabindex="0" role="application" aria-label="the cells of the state box: arrow keys go '
+        'from cell to cell, Enter starts a run"></div>'
         '<div class="details"><h3>Cell and run</h3><div id="cell" aria-live="polite">Point at a '
         'cell.</div><div id="run" aria-live="polite"></div></div></div>'
         '<ul id="legend" class="legend"></ul>'
         f'<p class="note">Point at a cell for its value, its control and where its samples go.'
-        f"{click}{sampled} What is drawn here is for looking at; what is proved stands above.</p>"
+        f"{click} By keyboard: arrows and Enter.{sampled} What is drawn here is for looking at; "
+        "what is proved stands above.</p>"
         '<div id="time" class="plot low" role="img" aria-label="states and controls of the last '
         'run, step by step"></div>'
     )

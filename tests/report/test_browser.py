@@ -68,7 +68,11 @@ def test_a_cell_answers(pages, solved):
         const marks = document.querySelectorAll(".over .diamond").length;
         map.emit("plotly_click", at);
         await wait(300);
-        return {{ cell, marks, run: document.getElementById("run").textContent }};""",
+        const run = document.getElementById("run").textContent;
+        for (const key of ["ArrowRight", "ArrowDown"]) {{
+          map.dispatchEvent(new KeyboardEvent("keydown", {{ key }}));
+        }}
+        return {{ cell, marks, run, next: document.getElementById("cell").textContent }};""",
     )
     index = ", ".join(str(i) for i in np.unravel_index(cell, result.partition.shape))
     assert f"[{index}]" in said["cell"]
@@ -76,6 +80,8 @@ def test_a_cell_answers(pages, solved):
     assert "goes to" in said["cell"]
     assert said["marks"] == 4
     assert "reached A" in said["run"]
+    i, j = np.unravel_index(cell, result.partition.shape)
+    assert f"[{min(i + 1, 9)}, {max(j - 1, 0)}]" in said["next"]
 
 
 def test_sliders_move_the_slice(pages, solved):
