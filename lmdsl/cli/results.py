@@ -21,13 +21,16 @@ def add(command: Command) -> None:
 
     simulate = command("simulate", _simulate, "Run the true map under a saved controller.")
     shared(simulate, "dir")
-    simulate.add_argument("--starts", type=int, default=10_000, metavar="N")
+    simulate.add_argument("--starts", type=int, default=10_000, metavar="N",
+                          help="random runs (default 10000)")  # fmt: skip
     simulate.add_argument("--from", dest="given", action="append", metavar="X,Y",
                           help="a state to start from, instead; may be repeated")  # fmt: skip
     simulate.add_argument("--parameter", action="append", default=[], metavar="NAME=VALUE",
                           help="another value of a parameter; may be repeated")  # fmt: skip
-    simulate.add_argument("--steps", type=int, default=10_000, metavar="T")
-    simulate.add_argument("--seed", type=int, default=0, metavar="S")
+    simulate.add_argument("--steps", type=int, default=10_000, metavar="T",
+                          help="steps of each run at most (default 10000)")  # fmt: skip
+    simulate.add_argument("--seed", type=int, default=0, metavar="S",
+                          help="of starts and noise (default 0)")  # fmt: skip
     simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
                           help="with a local controller, steps after the arrival")  # fmt: skip
     simulate.add_argument("--interpolated", action="store_true",

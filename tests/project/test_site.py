@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import inspect
 import re
 import runpy
@@ -9,6 +10,7 @@ import runpy
 from pages import ROOT, missing
 
 import lmdsl as lm
+from lmdsl import cli
 from lmdsl.advice.studies import record
 from lmdsl.cli import solving
 from lmdsl.control import simulation
@@ -76,6 +78,16 @@ def test_every_column_and_line_of_other_reports_is_explained():
     columns = [*comparison.HEAD, *(name for name, _, _ in record.COLUMNS)]
     known = WORDS.replace("*", "")
     assert not [word for word in (*runs, *columns) if word not in known]
+
+
+def test_every_option_says_what_it_does():
+    parser = cli._parser()
+    (commands,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+    for name, command in commands.choices.items():
+        for action in command._actions:
+            assert action.help, f"{name}: {action.option_strings or action.dest}"
+            letters = re.search(r"\b(of|in|to|from) [AZC]\b", action.help)
+            assert not letters, f"{name}: {action.help}"
 
 
 def test_letters_of_the_mathematics_are_not_printed():
