@@ -19,25 +19,7 @@ def add(command: Command) -> None:
                         help="judge in rational arithmetic, without tolerance")  # fmt: skip
     shared(verify, "--time-limit", "--json")
 
-    simulate = command("simulate", _simulate, "Run the true map under a saved controller.")
-    shared(simulate, "dir")
-    simulate.add_argument("--starts", type=int, default=10_000, metavar="N",
-                          help="random runs (default 10000)")  # fmt: skip
-    simulate.add_argument("--from", dest="given", action="append", metavar="X,Y",
-                          help="a state to start from, instead; may be repeated")  # fmt: skip
-    simulate.add_argument("--parameter", action="append", default=[], metavar="NAME=VALUE",
-                          help="another value of a parameter; may be repeated")  # fmt: skip
-    simulate.add_argument("--steps", type=int, default=10_000, metavar="T",
-                          help="steps of each run at most (default 10000)")  # fmt: skip
-    simulate.add_argument("--seed", type=int, default=0, metavar="S",
-                          help="of starts and noise (default 0)")  # fmt: skip
-    simulate.add_argument("--hold", type=int, default=1_000, metavar="T",
-                          help="with a local controller, steps after the arrival")  # fmt: skip
-    simulate.add_argument("--interpolated", action="store_true",
-                          help="also under the controller interpolated between cells")  # fmt: skip
-    simulate.add_argument("--as-compiled", action="store_true",
-                          help="follow the compiled steps and noise nodes")  # fmt: skip
-    shared(simulate, "--time-limit", "--json")
+    _add_simulate(command)
 
     prove = command("prove", _prove, "Prove what the controller does on the true map, by volume.")
     shared(prove, "dir")
@@ -70,6 +52,28 @@ def _add_report(command: Command) -> None:
                         help="compare these backends on the page")  # fmt: skip
     report.add_argument("--seed", type=int, default=0, metavar="S", help="of the runs shown")
     shared(report, "--time-limit")
+
+
+def _add_simulate(command: Command) -> None:
+    sub = command("simulate", _simulate, "Run the true map under a saved controller.")
+    shared(sub, "dir")
+    sub.add_argument("--starts", type=int, default=10_000, metavar="N",
+                     help="random runs (default 10000)")  # fmt: skip
+    sub.add_argument("--from", dest="given", action="append", metavar="X,Y",
+                     help="a state to start from, instead; may be repeated")  # fmt: skip
+    sub.add_argument("--parameter", action="append", default=[], metavar="NAME=VALUE",
+                     help="another value of a parameter; may be repeated")  # fmt: skip
+    sub.add_argument("--steps", type=int, default=10_000, metavar="T",
+                     help="steps of each run at most (default 10000)")  # fmt: skip
+    sub.add_argument("--seed", type=int, default=0, metavar="S",
+                     help="of starts and noise (default 0)")  # fmt: skip
+    sub.add_argument("--hold", type=int, default=1_000, metavar="T",
+                     help="with a local controller, steps after the arrival")  # fmt: skip
+    sub.add_argument("--interpolated", action="store_true",
+                     help="also under the controller interpolated between cells")  # fmt: skip
+    sub.add_argument("--as-compiled", action="store_true",
+                     help="follow the compiled steps and noise nodes")  # fmt: skip
+    shared(sub, "--time-limit", "--json")
 
 
 def _verify(parsed: Arguments) -> int:
