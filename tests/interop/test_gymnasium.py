@@ -231,6 +231,43 @@ def test_the_car_on_the_mountain():
     assert twice.next(position=-0.3, velocity=0.01, push=2.0) == system.next(**once, push=2.0)
 
 
+def cart_pole(cells, repeat):
+    """Safety, as a run that ends with probability 0.01 a step and no other way."""
+    ends = dict(zip(("x", "v", "theta", "omega"), (2.4, 3, 0.2094, 3), strict=True))
+    env = gymnasium.make("CartPole-v1")
+    return lm.Problem(
+        system=lm.interop.from_gym(env, [*ends], "push", repeat=repeat),
+        state_box={name: {"low": -a, "high": a, "cells": n}
+                   for (name, a), n in zip(ends.items(), cells, strict=True)},
+        attractor={},
+        discount=0.99,
+        control_grid={"push": {"values": [0, 1]}},
+        stage_cost="(x/2.4)**2 + (theta/0.2)**2",
+        sampling={"kind": "grid", "per_axis": 1},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("cells", "repeat", "least"),
+    [((5, 9, 9, 11), 2, 150), pytest.param((6, 12, 12, 16), 3, 500, marks=pytest.mark.long)],
+)
+def test_the_cart_pole_is_balanced_in_gymnasiums_own(cells, repeat, least):
+    """500 steps are all that Gymnasium asks for; without control it falls after about 10."""
+    result, own = lm.solve(cart_pole(cells, repeat)), gymnasium.make("CartPole-v1")
+    assert result.status == "verified"
+    for seed in range(5):
+        own.reset(seed=seed)
+        steps, ended, cut = 0, False, False
+        while not (ended or cut):
+            (u,) = result.controller(own.unwrapped.state)
+            for _ in range(repeat):
+                _, _, ended, cut, _ = own.step(int(u))
+                steps += 1
+                if ended or cut:
+                    break
+        assert steps >= least
+
+
 def test_the_cart_pole_can_fall_again_and_again():
     system = lm.interop.from_gym(
         gymnasium.make("CartPole-v1"), ["x", "v", "theta", "omega"], "push"
