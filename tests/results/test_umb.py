@@ -130,6 +130,16 @@ def test_umbi_reads_it(lp, tmp_path):
     labels, states = by_hand(tmp_path / "model.umb")
     assert ats.num_states == len(states)
     assert sorted(ats.initial_states) == [i for i, names in enumerate(labels) if "init" in names]
+    ats.validate()
+    choices = [choice for actions in states for choice in actions]
+    assert ats.num_choices == len(choices)
+    assert ats.num_branches == sum(len(row) for _, _, row in choices)
+    assert {*ats.choice_action_to_name} >= {name for name, _, _ in choices}
+    assert [*ats.reward_annotation_names] == ["cost"]
+    if hasattr(ats, "branch_to_probability"):  # of later versions; earlier ones keep one label
+        assert {*ats.ap_annotation_names} == {name for names in labels for name in names} - {"init"}
+        assert list(ats.branch_to_probability) == [p for *_, row in choices for p in row.values()]
+        assert list(ats.branch_to_target) == [j for *_, row in choices for j in row]
 
 
 def test_storm_reads_it(tmp_path):
