@@ -160,6 +160,8 @@ def regions(
     if len(view.axes) == 2:
         attractor = view.some(status == CellStatus.ATTRACTOR)
         outline(ax, view, attractor, "white" if not view.away else ATTRACTOR)
+        if (attractor & (code != CellStatus.ATTRACTOR)).any():
+            handles.append(_line(label="attractor", color=ATTRACTOR, linewidth=1.2))
     if legend:
         explain(ax, handles)
     return handles
@@ -187,12 +189,9 @@ def _filled(
     """Fill the regions of cells shown; outline where some of what lies over them is avoided."""
     handles = [region(ax, view, code == k, k, upright) for k in REGIONS if (code == k).any()]
     if partly.any() and len(view.axes) == 2:
-        from matplotlib.lines import Line2D
-
         outline(ax, view, partly, "white", 2.6, rings=False)
         outline(ax, view, partly, INK, 1.2, rings=False, dashed=True)
-        label = "avoid, in part"
-        handles.append(Line2D([], [], color=INK, linewidth=1.2, linestyle="--", label=label))
+        handles.append(_line(label="avoid, in part", color=INK, linewidth=1.2, linestyle="--"))
     return handles
 
 
@@ -220,8 +219,6 @@ def explain(ax: Any, handles: list[Any]) -> None:
 
 def _around(ax: Any, view: View, mask: Bools) -> Any:
     """Draw a line around cells, in one dimension below them; return its legend handle."""
-    from matplotlib.lines import Line2D
-
     line: dict[str, Any] = {"color": SURE, "linewidth": 2.2}
     if len(view.axes) == 2:
         outline(ax, view, mask, SURE, 1.6, rings=False)
@@ -230,4 +227,11 @@ def _around(ax: Any, view: View, mask: Bools) -> Any:
             ax.plot(
                 box[:2, 0], [0.012, 0.012], transform=ax.get_xaxis_transform(), zorder=3, **line
             )
-    return Line2D([], [], label="surely arrives", **line)
+    return _line(label="surely arrives", **line)
+
+
+def _line(**look: Any) -> Any:
+    """Return a line for a legend."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], **look)
