@@ -33,7 +33,7 @@ def check(
     time_limit
         Seconds.
     progress
-        Called with (stage, -1).
+        Called with (stage, -1); True shows it on stderr.
 
     Raises
     ------

@@ -241,7 +241,7 @@ def explain(
     time_limit
         Seconds. Hints that were not tried by then are left out.
     progress
-        Called with (stage, fraction done, or -1) during long work.
+        Called with (stage, fraction done, or -1) during long work; True shows it on stderr.
 
     Raises
     ------

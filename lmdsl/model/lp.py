@@ -265,7 +265,7 @@ def compile(  # noqa: A001
     problem
         The declared problem, or the path of its file.
     progress
-        Called with (stage, fraction done) during long work.
+        Called with (stage, fraction done) during long work; True shows it on stderr.
     time_limit
         Seconds. What takes a moment is compiled whatever the limit.
     dropped

@@ -76,7 +76,7 @@ def write_directory(
     time_limit
         Seconds for compiling the model, for checking, and for each backend.
     progress
-        Called with (stage, fraction done, or -1).
+        Called with (stage, fraction done, or -1); True shows it on stderr.
     """
     from lmdsl.results.comparison import compare
 

@@ -220,7 +220,7 @@ class Result(Paged, Carried, Summary, InUse):
         bracket
             Whether to bound what any control law costs, too.
         progress
-            Called with (stage, fraction done).
+            Called with (stage, fraction done); True shows it on stderr.
 
         Raises
         ------

@@ -273,7 +273,7 @@ class Paged:
         seed
             Of the runs that are simulated where the result has none.
         progress
-            Called with (stage, fraction done, or -1).
+            Called with (stage, fraction done, or -1); True shows it on stderr.
 
         Raises
         ------

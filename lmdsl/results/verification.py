@@ -123,7 +123,7 @@ def verify(
     exact
         Judge in rational arithmetic, without tolerance on claims 1 to 3 (slower).
     progress
-        Called with (stage, fraction done) during long work.
+        Called with (stage, fraction done) during long work; True shows it on stderr.
     time_limit
         Seconds.
 

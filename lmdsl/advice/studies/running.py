@@ -63,7 +63,7 @@ def study(
     time_limit
         Seconds for each variant, and again for its runs.
     progress
-        Called with (stage, fraction done, or -1).
+        Called with (stage, fraction done, or -1); True shows it on stderr.
 
     Raises
     ------

@@ -89,7 +89,7 @@ def suggest(
     time_limit
         Seconds, after which the best so far is suggested.
     progress
-        Called with (stage, fraction done).
+        Called with (stage, fraction done); True shows it on stderr.
 
     Raises
     ------

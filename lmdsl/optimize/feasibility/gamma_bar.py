@@ -146,7 +146,7 @@ def gamma_max(
     problem
         A problem, the path of its file, or its compiled LP; its own gamma plays no part.
     progress
-        Called with (stage, fraction done, or -1).
+        Called with (stage, fraction done, or -1); True shows it on stderr.
     time_limit
         Seconds; then the bracket is as tight as it was made by then.
     width
