@@ -181,7 +181,7 @@ def test_what_cannot_be_chosen_is_refused():
     with pytest.raises(lm.BadInput, match="finite model"):
         lm.suggest(finite)
     with pytest.raises(lm.BadInput, match="not a Problem"):
-        lm.suggest("problem.json")
+        lm.suggest({"problem": 1})
     with pytest.raises(lm.TimeLimitReached):
         lm.suggest(made(brake()), time_limit=1e-9)
 

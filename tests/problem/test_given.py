@@ -40,7 +40,7 @@ def test_what_is_compiled_is_taken_as_it_is(path):
 
 
 @pytest.mark.parametrize("verb", [lm.compile, lm.solve, lm.compare, lm.gamma_max, lm.explain,
-                                  lm.check, lm.study])  # fmt: skip
+                                  lm.check, lm.study, lm.suggest])  # fmt: skip
 def test_what_is_no_problem_is_refused(verb, tmp_path):
     for bad in (3, None, {"format": "lmdsl/1"}, [PROBLEM]):
         with pytest.raises(lm.BadInput, match="a Problem or the path of a problem file"):

@@ -16,15 +16,14 @@ from lmdsl.advice.suggesting import choices
 from lmdsl.advice.suggesting.choices import Combination
 from lmdsl.advice.suggesting.pilots import Attempt, sampling_words, tried
 from lmdsl.advice.suggesting.report import Suggestion, changes
-from lmdsl.common import inputs
-from lmdsl.common.types import Progress
+from lmdsl.common.types import FilePath, Progress
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.assembly import estimates
+from lmdsl.problem import Problem, given
 from lmdsl.problem.local_control import without_orbit
-from lmdsl.problem.problem import Problem
 from lmdsl.systems import MatrixSystem
 
 # Additions that a trial takes about, and up to which the problem itself is tried.
@@ -72,7 +71,7 @@ class _Trials:
 
 @own_arithmetic
 def suggest(
-    problem: Problem,
+    problem: Problem | FilePath,
     *,
     time_limit: float | Deadline | None = None,
     progress: Progress | None = None,
@@ -85,7 +84,7 @@ def suggest(
     Parameters
     ----------
     problem
-        A problem with a map or a differential equation.
+        A problem with a map or a differential equation, or the path of its file.
     time_limit
         Seconds, after which the best so far is suggested.
     progress
@@ -98,7 +97,7 @@ def suggest(
     TimeLimitReached
         The time was up before the first trial.
     """
-    inputs.kind(problem, Problem, "problem", "a Problem")
+    problem = given(problem)
     if isinstance(problem.system, MatrixSystem):
         raise BadInput("a finite model has its states and no samples; nothing is to be chosen",
                        "problem")  # fmt: skip
