@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Floats
+from lmdsl.common.types import Floats, Statuses
 from lmdsl.explanation.one_cell import NAMES
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof.record import Proof
 from lmdsl.proof.search import ARRIVES, LOST, UNDECIDED
 from lmdsl.report.browser import packed
 from lmdsl.results.result import Result
-from lmdsl.results.status import Status
+from lmdsl.results.status import Cause, Status
 
 MOST_DRAWN = 250_000  # cells of which values are given
 MOST_FULL = 2_000_000  # cells of which controls and statuses are given
@@ -45,6 +45,7 @@ def cells_of(result: Result, proof: Proof | None) -> dict[str, Any]:
     whole = p.size <= MOST_FULL
     own = slice(None) if whole else shown.ravel()
     index = result.control_index[own] + 1  # 0: none
+    code = regions_of(result)
     return {
         "axes": [
             {"name": name, "low": axis.low, "high": axis.high, "width": axis.width,
@@ -56,12 +57,12 @@ def cells_of(result: Result, proof: Proof | None) -> dict[str, Any]:
         "step": step,
         "drawn": list(shown.shape),
         "whole": whole,
-        "status": packed(result.cell_status[own]),
+        "status": packed(code[own]),
         "index": packed(index.astype(np.uint16 if len(result.control_vectors) < 65535
                                      else np.int32)),
         "controls": list(result.problem.controls),
         "vectors": packed(result.control_vectors),
-        "regions": _regions(result),
+        "regions": _regions(code),
         "layers": _layers(result, proof, shown.ravel()),
     }  # fmt: skip
 
@@ -73,9 +74,18 @@ def _step(shape: tuple[int, ...]) -> int:
     return step
 
 
-def _regions(result: Result) -> list[dict[str, Any]]:
+def regions_of(result: Result) -> Statuses:
+    """Return what every cell is: its status, or that a refusal speaks of it, shape (N,)."""
+    code = result.cell_status.copy()
+    if result.cause == Cause.GAMMA:
+        refused = (code == CellStatus.STABILIZED) & (result.refusal_vector > 0)
+        code[refused] = CellStatus.BEYOND_GAMMA
+    return code
+
+
+def _regions(code: Statuses) -> list[dict[str, Any]]:
     """Return the regions that occur, but the stabilized cells: those are coloured by value."""
-    counts = np.bincount(result.cell_status, minlength=len(CellStatus))
+    counts = np.bincount(code, minlength=len(CellStatus))
     return [
         {"code": int(code), "name": name, "light": light, "mark": mark, "cells": int(counts[code])}
         for code, (name, light, mark) in REGIONS.items()

@@ -9,12 +9,22 @@ from collections.abc import Iterator
 from lmdsl.proof.record import Proof
 from lmdsl.report.mathematics import number
 from lmdsl.results.result import Result
-from lmdsl.results.status import Status
+from lmdsl.results.status import Cause, Status
+from lmdsl.systems import MatrixSystem
 
 PROVED, REFUTED, OPEN, ASSUMED, EVIDENCE, UNKNOWN = (
     "proved", "refuted", "not proved", "assumed", "evidence", "unknown",
 )  # fmt: skip
 MODEL, TRUE, BOTH = "finite model", "true map", "true map as compiled"
+
+# Why a problem is refused.
+REFUSED = {
+    Cause.EMPTY: "there is no cell from which A is reached for certain",
+    Cause.MEASURE: "no cell that carries weight of m can be stabilized",
+    Cause.GAMMA: "no law has a finite cost at this weight γ",
+    Cause.REQUIRE_ALL: "not every cell outside A and Z can be stabilized, which was asked for",
+    Cause.HOLD: "no attractor cell can be held",
+}
 
 ClaimRow = dict[str, str]
 
@@ -55,8 +65,10 @@ def _coverage(result: Result) -> Iterator[ClaimRow]:
         return
     share = "no free cell" if covered.share is None else percent(covered.share)
     figure = f"{share}: {covered.stabilizable:,} of {covered.free:,} cells outside A and Z"
-    yield _row(PROVED, MODEL, "How much of the box the law serves (coverage): from all other cells "
-               "it is lost or refused, see below", figure)  # fmt: skip
+    claim = "How much of the box can be stabilized, and is served (coverage); the rest see below"
+    if result.status == Status.NOT_STABILIZABLE:
+        claim = "How much of the box could be stabilized, all that is refused here apart"
+    yield _row(PROVED, MODEL, claim, figure)
 
 
 def _refusal(result: Result) -> Iterator[ClaimRow]:
@@ -64,7 +76,8 @@ def _refusal(result: Result) -> Iterator[ClaimRow]:
     if result.gamma_bar:
         low, high = result.gamma_bar
         figure = f"largest feasible weight γ between {number(low, 9)} and {number(high, 9)}"
-    yield _row(PROVED, MODEL, f"It cannot be stabilized as asked: {result.message}", figure)
+    why = "as asked" if result.cause is None else REFUSED[result.cause]
+    yield _row(PROVED, MODEL, f"It cannot be stabilized: {why}", figure)
 
 
 def _model(result: Result) -> Iterator[ClaimRow]:
@@ -93,7 +106,8 @@ def _model(result: Result) -> Iterator[ClaimRow]:
 def _safe(result: Result) -> Iterator[ClaimRow]:
     safe = result.certificate.safe
     if safe is None:
-        if result.problem.successors != "enclosed" and result.verified:
+        given = isinstance(result.problem.system, MatrixSystem)  # without samples
+        if not given and result.problem.successors != "enclosed" and result.verified:
             claim = "That no run between the sample points is lost: the model sees samples only"
             yield _row(OPEN, TRUE, claim, "successors are sampled, not enclosed")
         return
@@ -116,7 +130,8 @@ def _local(result: Result) -> Iterator[ClaimRow]:
     local = result.local_controller
     if local is None:
         if not result.problem.attractor.empty and result.verified:
-            yield _row(OPEN, TRUE, "What happens inside A after it is reached: the problem names "
+            about = MODEL if isinstance(result.problem.system, MatrixSystem) else TRUE
+            yield _row(OPEN, about, "What happens inside A after it is reached: the problem names "
                        "no controller there", "no local controller")  # fmt: skip
         return
     kept = local.proved is not None and local.proved == (local.holding or local.cells)
@@ -154,7 +169,7 @@ def _runs(result: Result) -> Iterator[ClaimRow]:
 
 def _proof(result: Result, proof: Proof | None) -> Iterator[ClaimRow]:
     if proof is None:
-        if result.verified:
+        if result.verified and not isinstance(result.problem.system, MatrixSystem):
             yield _row(UNKNOWN, TRUE, "What share of the stabilizable set arrives for certain",
                        "not asked for: lmdsl prove")  # fmt: skip
         return

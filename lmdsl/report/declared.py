@@ -5,6 +5,7 @@ from itertools import islice
 from typing import Any
 
 from lmdsl.model.discretization import control_count, sample_points
+from lmdsl.problem.consistency.endings import numbered
 from lmdsl.problem.noise import NoiseNormal, NoiseUniform
 from lmdsl.problem.problem import Problem
 from lmdsl.problem.sampling import Grid
@@ -60,10 +61,12 @@ def _summary(problem: Problem) -> str:
     if problem.controls:
         count = control_count(problem)
         goal = "A feedback law is sought that chooses "
-        goal += f"one of {count:,} control values" if count > 1 else "the one control value"
+        what_ = "action" if numbered(problem) else "control value"
+        goal += f"one of {count:,} {what_}s" if count > 1 else f"the one {what_}"
     else:
         goal = "It has no control, so this is an analysis of its stability. Every cell has one row"
-    goal += f" in each of {cells:,} cells of the {d}-dimensional state box"
+    goal += f" in each of {cells:,} "
+    goal += "states" if numbered(problem) else f"cells of the {d}-dimensional state box"
     if problem.attractor.empty:
         return f"{what}{goal}, so that the discounted cost is least: there is no target to reach."
     return f"{what}{goal}: it must reach the attractor A from as many cells as possible, at the " \
@@ -146,6 +149,10 @@ def _row(name: str, text: str, *math: str) -> DeclaredRow:
 
 
 def _states(problem: Problem) -> Iterable[DeclaredRow]:
+    if numbered(problem):
+        for state, axis in problem.state_box.items():
+            yield _row("state", f"{axis.cells:,} of them", m.block(m.name(state), False))
+        return
     for state, axis in problem.state_box.items():
         ends = f"{m.number(axis.low)} to {m.number(axis.high)}"
         circle = ", a circle" if axis.periodic else ""
@@ -265,8 +272,14 @@ def _costs(problem: Problem, names: Collection[str]) -> Iterable[DeclaredRow]:
         yield _row("cost G", "the integral along the step of", math)
     elif callable(problem.stage_cost):
         yield _row("cost G", "a Python function")
+    elif numbered(problem) and str(problem.stage_cost).strip() == "0":
+        yield _row("cost G", "given with the rows")
     else:
-        yield _row("cost G", "", m.block(m.shown(str(problem.stage_cost), names), False))
+        beside = "given with the rows, and" if numbered(problem) else ""
+        yield _row("cost G", beside, m.block(m.shown(str(problem.stage_cost), names), False))
+    reward = getattr(problem.system, "best_reward", None)
+    if reward is not None:
+        yield _row("rewards", f"are maximised: G is {m.number(reward, 9)} minus the reward")
     if problem.terminal_cost is not None:
         math = m.block(m.shown(problem.terminal_cost, names), False)
         yield _row("terminal cost F", "on entering A:", math)

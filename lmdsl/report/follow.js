@@ -123,7 +123,8 @@ class Follower {
     this.controls = data.cells.controls;
     this.arrays = arrays;
     this.map = data.map;
-    this.able = data.cells.whole && (data.map !== null || data.rows !== null);
+    this.able = data.cells.whole && data.starts !== null
+      && (data.map !== null || data.rows !== null);
     if (data.map !== null) {
       this.program = compiled(data.map.program);
       this.stage = data.map.stage && compiled(data.map.stage);

@@ -112,7 +112,8 @@ def claims(data: PlainData) -> str:
          text(row["claim"]), text(row["about"]), f"<strong>{text(row['figure'])}</strong>")
         for row in data["claims"]
     ]  # fmt: skip
-    reasons = "".join(f"<li>{text(reason)}</li>" for reason in data["reasons"])
+    said = [reason for reason in data["reasons"] if reason != data["result"]["message"]]
+    reasons = "".join(f"<li>{text(reason)}</li>" for reason in said)
     why = f"<p>Why it is not verified:</p><ul>{reasons}</ul>" if reasons else ""
     assumed = f"; it assumes that {text(data['assumes'])}" if data["assumes"] else ""
     return (
@@ -128,7 +129,9 @@ def claims(data: PlainData) -> str:
 def pictures(data: PlainData) -> str:
     """Return the frame of the pictures, which the script fills."""
     how = "this page runs the map as it was declared"
-    if data["map"] is None:
+    if data["starts"] is None:
+        how = ""
+    elif data["map"] is None:
         how = "this page draws them from the rows of the finite model"
         if data["rows"] is None:
             how = ""
@@ -288,6 +291,10 @@ def repeat(data: PlainData) -> str:
     digest = f"<p>Compiled model: SHA-256 <code>{text(again['digest'])}</code></p>"
     notes = "".join(f"<li>{text(note)}</li>" for note in data["notes"])
     left = f"<p>Left out of this page:</p><ul>{notes}</ul>" if notes else ""
+    spent = data["result"]["seconds"]
+    stages = {"compile": "compiling", "solve": "solving", "verify": "checking"}
+    took = [f"{word} took {spent[k]:.3g} s" for k, word in stages.items() if spent[k] is not None]
+    made += f"{'; '.join(took).capitalize()}. " if took else ""
     return (
         f"<pre>{lines(chr(10).join(commands))}</pre>{held}{digest if again['digest'] else ''}"
         f"<p>{made}This page was written with {text(versions)}; seed {again['seed']}.</p>{left}"

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+
+import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.files import write_whole
@@ -12,6 +15,9 @@ from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, LmdslError, MissingDependency, plain_text, shown
 from lmdsl.machine import memory
 from lmdsl.machine.surroundings import own_arithmetic
+from lmdsl.model.lp import StabilizationLP, compile
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.optimize.feasibility.restriction import restricted
 from lmdsl.proof.record import Proof
 from lmdsl.report.gathering import Beside, gathered
 from lmdsl.report.page import page
@@ -42,9 +48,8 @@ def write(
             raise BadInput("it is a proof of another result", "proof")
     if comparison is not None:
         inputs.kind(comparison, Comparison, "comparison", "what lmdsl.compare returns")
-    missing = "" if result.lp is not None else "spectrum: the result was read from a directory, " \
-        "which holds no model; `lmdsl report DIR` compiles it again"  # fmt: skip
-    asked = Beside(result.lp, proof or result.proof, comparison, missing=missing)
+    lp, missing = _model(result, lambda: compile(result.problem, progress, dropped=result.dropped))
+    asked = Beside(lp, proof or result.proof, comparison, missing=missing)
     _write(result, path, asked, inputs.seed(seed), progress)
 
 
@@ -86,11 +91,7 @@ def write_directory(
     stored = archive.read(directory)
     result = stored.result
     proof = proved.as_stored(directory, result, stored.certificate.proof)
-    lp, missing = None, ""
-    try:
-        lp = recompiled(directory, result, progress, time_limit)
-    except LmdslError as error:
-        missing = f"spectrum and decay: the model was not compiled: {plain_text(error)}"
+    lp, missing = _model(result, lambda: recompiled(directory, result, progress, time_limit))
     found = verify(directory, progress=progress, time_limit=time_limit) if check else None
     comparison = None
     if backends:
@@ -102,6 +103,22 @@ def write_directory(
     asked = Beside(lp, proof, comparison, found, str(directory), missing, made_by)
     _write(result, target, asked, inputs.seed(seed), progress)
     return target, found
+
+
+def _model(
+    result: Result, make: Callable[[], StabilizationLP]
+) -> tuple[StabilizationLP | None, str]:
+    """Return the model of a result, made anew where it has none, or why there is none."""
+    if result.lp is not None:
+        return result.lp, ""
+    try:
+        lp = make()
+    except (LmdslError, MemoryError) as error:
+        return None, f"spectrum and decay: the model was not compiled: {plain_text(error)}"
+    beyond = result.cell_status[lp.cells] == CellStatus.BEYOND_GAMMA
+    if not beyond.any():
+        return lp, ""
+    return restricted(lp, np.where(beyond, result.refusal_vector[lp.cells], 0.0)) or lp, ""
 
 
 def _write(

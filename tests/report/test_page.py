@@ -233,6 +233,37 @@ def test_results_of_functions_have_a_page(tmp_path, library):
     assert "Left out of this page" in read.text
 
 
+def test_a_loaded_result_is_compiled_for_its_spectrum(solved, tmp_path, library):
+    solved("maze").save(tmp_path / "out")
+    for result, name in ((solved("maze"), "a.html"), (lm.Result.load(tmp_path / "out"), "b.html")):
+        result.report(tmp_path / name)
+    a, b = (json.loads(Read((tmp_path / x).read_text()).scripts[0]) for x in ("a.html", "b.html"))
+    assert a["loop"] is not None
+    assert a["loop"] == b["loop"]
+
+
+def two_basins():
+    """x+ = x - 0.25 u below 0.5, a tent above it: there gamma is limited, and here it is not."""
+    box = {"x": {"low": 0, "high": 1, "cells": 16}}
+    image = "where(x > 0.5, 0.5 + mod(3*(x - 0.5), 0.5), x - 0.25*u)"
+    return steps(system={"kind": "map", "next": {"x": image}}, state_box=box,
+                 attractor={"boxes": [{"x": [0, 0.25]}, {"x": [0.5, 0.625]}]})  # fmt: skip
+
+
+def test_what_gamma_leaves_out_is_told(tmp_path, library):
+    problem = made(two_basins()).replaced(gamma=3.0)
+    refused = lm.solve(problem)
+    found = told(refused)
+    assert np.array_equal(unpacked(found["cells"]["status"]) == 6, refused.refusal_vector > 0)
+    assert found["lost"][-1]["name"] == "no finite cost"
+    assert "no law has a finite cost" in written(refused).text
+    lm.solve(problem, restrict_to_gamma=True).save(tmp_path / "out")
+    path, _ = writing.write_directory(tmp_path / "out")
+    loop = json.loads(Read(path.read_text()).scripts[0])["loop"]
+    assert loop["cells"] == 4
+    assert loop["left"] == [1.0, 0.0]
+
+
 def test_finite_models_have_a_page(tmp_path, library):
     P = np.array([[[1, 0, 0], [0.5, 0.5, 0], [0, 0.5, 0.5]]] * 2)
     cost = np.array([[0.0, 0.0], [1.0, 2.0], [3.0, 1.0]])
@@ -240,6 +271,8 @@ def test_finite_models_have_a_page(tmp_path, library):
     lm.solve(problem).report(tmp_path / "a.html")
     read = Read((tmp_path / "a.html").read_text())
     assert "a finite model, given by its rows" in read.text
+    assert "one of 2 actions in each of 3 states" in read.text
+    assert "true map" not in read.text.split("Words used on this page")[0]
     assert json.loads(read.scripts[0])["map"] is None
 
 
