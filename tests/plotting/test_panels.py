@@ -144,6 +144,23 @@ def test_slices_through_two_axes_make_a_table(solved):
     assert "slices along x and v" in page.get_suptitle()
 
 
+def test_slices_of_one_axis_have_the_same_ordinate(solved):
+    page = plotting.slices(solved("lorenz"), axes=["z"], panels=3)
+    shown = panels(page)
+    assert len(shown) == 9
+    assert len({(*ax.get_ylim(), ax.get_yscale()) for ax in shown}) == 1
+    low, high = shown[0].get_ylim()
+    heights = [
+        patch.get_data().values
+        for ax in shown
+        for patch in ax.patches
+        if type(patch).__name__ == "StepPatch"
+    ]
+    assert heights
+    assert low <= np.nanmin(heights)
+    assert high >= np.nanmax(heights)
+
+
 def test_slices_are_where_they_are_asked_for(solved):
     result = solved("cart")
     page = plotting.slices(

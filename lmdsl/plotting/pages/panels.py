@@ -119,7 +119,7 @@ def projections(
     pairs: list[tuple[str, ...]] = list(itertools.combinations(free, 2)) or [tuple(free)]
     views = [view_of(result, pair, at, how) for pair in pairs[:MOST]]
     word = "share" if draw == "coverage" else how
-    title = f"{quantity.title}, {word} over the axes not shown"
+    title = quantity.title + f", {word} over the axes not shown" * (not views[0].whole)
     title += f" ({views[0].held})" * bool(views[0].hidden)
     return _page(result, quantity, views, _table(len(views)), [], title, target)
 
@@ -149,6 +149,8 @@ def _page(
         for handle in regions.regions(ax, view, code, legend=False):
             handles.setdefault(handle.get_label(), handle)
         panels.append(ax)
+    if len(views[0].axes) == 1:
+        _same_height(panels)
     if titles:  # all show the same axes
         for ax in panels:
             ax.label_outer()
@@ -156,11 +158,25 @@ def _page(
         layers.shared_bar(panels, picture)
     if handles:
         page.legend(
-            handles=list(handles.values()), loc="outside lower center", ncols=6, frameon=False
+            handles=list(handles.values()),
+            loc="outside lower center",
+            ncols=2 * columns,
+            frameon=False,
         )
     page.suptitle(f"{plain(result.problem.name, 80)}\n{title}".strip(), fontsize=12)
     writing.write(page, target)
     return page
+
+
+def _same_height(panels: list[Any]) -> None:
+    """Give panels of curves the same ordinate."""
+    drawn = [ax for ax in panels if ax.patches and ax.get_ylabel()] or panels
+    scale = "log" if any(ax.get_yscale() == "log" for ax in drawn) else "linear"
+    low = min(ax.get_ylim()[0] for ax in drawn)
+    high = max(ax.get_ylim()[1] for ax in drawn)
+    for ax in panels:
+        ax.set_yscale(scale)
+        ax.set_ylim(low, high)
 
 
 def _several(value: Any) -> bool:
