@@ -193,7 +193,8 @@ class Simulation(Frozen):
             rows.append(("steps", ", ".join(f"{k} {v:,}" for k, v in self.steps.items())))
         if self.cost:
             rows.append(("mean cost", f"{self._mean()}, of {int(self.cost['runs'] or 0):,} runs"))
-        title = f"{self.starts:,} runs of the {self.followed} from random starts"
+        which = "given" if self.given else "random"
+        title = f"{self.starts:,} runs of the {self.followed} from {which} starts"
         return facts([*rows, ("", self.sentence())], title)
 
     def _paid(self, cost: MeanCost) -> str:

@@ -235,8 +235,11 @@ def test_a_study_as_data_and_as_a_table(tmp_path):
 def test_names_of_a_stranger_are_inert_in_the_table():
     study = record.Study("x", (row(backend="\x1b[2J", status="bad_input",
                                                      message="a\nb\x07"),))  # fmt: skip
-    assert "\x1b" not in str(study)
-    assert "\x07" not in str(study)
+    for text in (str(study), study._repr_html_()):
+        assert "\x1b" not in text
+        assert "\x07" not in text
+    marked = record.Study("x", (row(status="bad_input", message="<b>bold</b>"),))
+    assert "<b>" not in marked._repr_html_()
 
 
 def test_from_the_command_line(tmp_path, capsys):

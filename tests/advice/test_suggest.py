@@ -74,6 +74,7 @@ def test_a_step_that_is_too_short_is_lengthened(braked):
     assert found.before.coverage == before[0]
     assert "all else the same" in found.reasons[1]
     assert '"step"' in str(found)
+    assert "as suggested" in found._repr_html_()
 
 
 def test_cells_go_to_the_axis_that_needs_them():

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from lmdsl.common import html
 from lmdsl.common.records import Reported
 from lmdsl.errors import BadInput, printable
 
@@ -113,18 +114,31 @@ class Study(Reported):
 
     def table(self) -> str:
         """Return the study as text: a table, messages of what is not verified, and orders."""
-        head = [name for name, _, _ in COLUMNS]
-        lines = [head, *([_cell(read(row), how) for _, read, how in COLUMNS] for row in self.rows)]
+        head, rows = self._cells()
+        lines = [head, *rows]
         widths = [max(len(line[k]) for line in lines) for k in range(len(head))]
         text = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in lines]
         text.insert(1, "  ".join("-" * w for w in widths))
-        for line, row in zip(lines[1:], self.rows, strict=True):
-            if row.status != "verified" and row.message:
-                text.append(printable(f"{' '.join(line[:5])}: {row.message}"))
-        text += [str(order) for order in self.orders if order.order is not None]
-        return "\n".join(line.rstrip() for line in text)
+        return "\n".join(line.rstrip() for line in [*text, *self._notes()])
 
     __str__ = table
+
+    def _repr_html_(self) -> str:
+        return html.grid(*self._cells(), "Study", "\n".join(self._notes()))
+
+    def _cells(self) -> tuple[list[str], list[list[str]]]:
+        """Return the heads of the columns, and the rows as text."""
+        rows = [[_cell(read(row), how) for _, read, how in COLUMNS] for row in self.rows]
+        return [name for name, _, _ in COLUMNS], rows
+
+    def _notes(self) -> list[str]:
+        """Return what is said below the table."""
+        notes = [
+            printable(f"{' '.join(line[:5])}: {row.message}")
+            for line, row in zip(self._cells()[1], self.rows, strict=True)
+            if row.status != "verified" and row.message
+        ]
+        return notes + [str(order) for order in self.orders if order.order is not None]
 
     def records(self) -> list[dict[str, Any]]:
         """Return a flat dictionary for each row: the cells of each axis under ``cells.NAME``."""

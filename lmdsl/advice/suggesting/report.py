@@ -5,6 +5,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from lmdsl.advice.suggesting.pilots import Attempt, plain
+from lmdsl.common import html
 from lmdsl.common.records import Reported, jsonable
 from lmdsl.problem.problem import Problem
 
@@ -65,6 +66,12 @@ class Suggestion(Reported):
         return "\n".join([*lines, f"({count}{cut})"])
 
     __str__ = text
+
+    def _repr_html_(self) -> str:
+        rows = [(key, json.dumps(value)) for key, value in self.changes.items()]
+        rows += [("as declared", str(self.before))]
+        rows += [("as suggested", str(self.after)), ("why", "\n".join(self.reasons))] * self.better
+        return html.facts(rows, "Suggestion" if self.better else "Nothing better was found")
 
 
 def _short(key: str, value: Any) -> str:
