@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from pictures import logistic
 
 import lmdsl as lm
 from lmdsl import plotting
@@ -52,6 +53,13 @@ def test_every_frame_shows_the_states_of_the_loop(solved):
     assert len(arrived) == 3
     text = next(a for a in stage._moving(len(points) - 1) if hasattr(a, "get_text"))
     assert text.get_text() == f"step {len(points) - 1}: 3 of 4 in A, 1 lost"
+
+
+def test_runs_without_a_target_only_go_on():
+    data = {**logistic(), "attractor": {}, "discount": 0.9}
+    stage, _ = scene(lm.solve(lm.Problem.model_validate(data)), [[0.3]], steps=3)
+    text = next(a for a in stage._moving(2) if hasattr(a, "get_text"))
+    assert text.get_text() == "step 2"
 
 
 def test_steps_of_an_equation_have_pieces(solved):

@@ -52,7 +52,7 @@ def shell(monkeypatch):
 
 
 def test_the_value_of_a_cell_is_shown_once(solved, shell):
-    for draw in (plotting.cost, plotting.measure, plotting.trajectories, plotting.portrait):
+    for draw in (plotting.cost, plotting.portrait):
         (picture,) = shell.cell(lambda draw=draw: draw(solved("logistic")))
         assert picture.startswith(PNG)
     (page,) = shell.cell(lambda: plotting.slices(solved("lorenz"), panels=2))

@@ -145,6 +145,7 @@ class _Scene:
     reached: Bools
     lost: Bools
     pieces: int  # states a step
+    aimed: bool  # there is an attractor to reach
 
     @classmethod
     def of(
@@ -167,7 +168,8 @@ class _Scene:
             masks = (status == CellStatus.ATTRACTOR, status == CellStatus.AVOID)
             regions.obstacles(ax, view, *masks, legend=True, upright=False)
         ax.get_figure().suptitle(plain(result.problem.name, 60), fontsize=11)
-        return cls(ax, view, points, ended, reached, lost, pieces)
+        aimed = bool((status == CellStatus.ATTRACTOR).any())
+        return cls(ax, view, points, ended, reached, lost, pieces, aimed)
 
     def frames(self) -> Iterator[Pixels]:
         """Yield the frames."""
@@ -216,8 +218,9 @@ class _Scene:
             yield self.ax.scatter(
                 *where[lost].T, s=40, c=ink, marker="x", linewidths=width, zorder=4.5
             )
-        text = f"step {k // self.pieces}: {int(arrived.sum())} of {len(on)} in A"
-        text += f", {int(lost.sum())} lost" * bool(lost.any())
+        parts = [f"{int(arrived.sum())} of {len(on)} in A"] * self.aimed
+        parts += [f"{int(lost.sum())} lost"] * bool(lost.any())
+        text = f"step {k // self.pieces}" + ": " * bool(parts) + ", ".join(parts)
         yield self.ax.text(0, 1.02, text, transform=self.ax.transAxes, fontsize=10)
 
 
