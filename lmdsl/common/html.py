@@ -1,4 +1,4 @@
-"""Tables in HTML, as notebooks show objects: everything in them is text, nothing of it markup."""
+"""Objects in HTML, as notebooks show them: everything in it is text, nothing of it markup."""
 
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -8,6 +8,15 @@ from lmdsl.errors import printable
 
 LONGEST = 2_000  # characters of a cell
 LEFT = "text-align:left;vertical-align:top"
+
+
+def written(item: Any) -> str | None:
+    """Return what an object says of itself in lines; None where it has no words of its own."""
+    kind: Any = type(item)
+    if kind.__str__ is object.__str__:
+        return None
+    lines = "\n".join(escape(printable(line)) for line in str(item).split("\n"))
+    return f"<pre>{lines}</pre>"
 
 
 def facts(rows: Iterable[tuple[str, Any]], title: str = "") -> str:

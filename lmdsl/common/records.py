@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common.html import written
+
 
 def freeze(*arrays: NDArray[Any]) -> None:
     """Make arrays read-only: no caller, and no backend, may change what others hold."""
@@ -38,6 +40,9 @@ class Frozen:
 
     def _compared(self) -> list[Any]:
         return [getattr(self, field.name) for field in fields(self) if field.compare]  # type: ignore[arg-type]
+
+    def _repr_html_(self) -> str | None:
+        return written(self)
 
     def __getstate__(self) -> dict[str, Any]:
         return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
@@ -79,6 +84,9 @@ class Reported:
     def to_dict(self) -> dict[str, Any]:
         """Return strict JSON data: every field by its name."""
         return {f.name: jsonable(getattr(self, f.name)) for f in fields(self)}  # type: ignore[arg-type]
+
+    def _repr_html_(self) -> str | None:
+        return written(self)
 
 
 def jsonable(value: Any) -> Any:

@@ -15,7 +15,7 @@ from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.certificate.exact_sums import BLOCK
 from lmdsl.certificate.judge import exact_verdict, verdict
 from lmdsl.common import inputs
-from lmdsl.common.records import jsonable
+from lmdsl.common.records import Reported, jsonable
 from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, printable
 from lmdsl.machine import memory
@@ -43,7 +43,7 @@ from lmdsl.systems import MatrixSystem
 
 
 @dataclass(frozen=True)
-class Verification:
+class Verification(Reported):
     """The outcome of :func:`verify`.
 
     Attributes

@@ -19,8 +19,8 @@ HOSTILE = "<script>alert('&')</script><img src=x onerror=\"y\"> \x1b[31m"
 def text(shown):
     """The text of HTML that is well formed and holds nothing but tables."""
     tree = ElementTree.fromstring(f"<body>{shown._repr_html_()}</body>")
-    known = ["body", "div", "table", "caption", "thead", "tbody", "tr", "th", "td", "br", "p"]
-    assert {each.tag for each in tree.iter()} <= set(known)
+    known = ["body", "div", "table", "caption", "thead", "tbody", "tr", "th", "td", "br", "pre"]
+    assert {each.tag for each in tree.iter()} <= {*known, "p"}
     assert all(set(each.attrib) <= {"style"} for each in tree.iter())
     return " ".join(tree.itertext())
 
@@ -86,6 +86,18 @@ def test_problems_without_formulas_are_shown():
     assert "kind: lqr" in text(held)
     weights = made(steps()).replaced(measure={"weights": [1.0] * 4})
     assert "weights: [1.0, 1.0, 1.0, 1.0]" in text(weights)
+
+
+def test_reports_are_shown_as_they_are_printed(result, tmp_path):
+    result.save(tmp_path / "out")
+    trapped = made(steps(avoid={"boxes": [{"x": [0.5, 0.75]}]}, name=HOSTILE))
+    for shown in (
+        lm.check(result.problem), lm.verify(tmp_path / "out"), lm.gamma_max(result.lp),
+        lm.explain(trapped), lm.solve(made(steps())).prove(),
+    ):  # fmt: skip
+        assert text(shown) == str(shown)
+    assert result.controller._repr_html_() is None  # it has no words
+    assert result.coverage._repr_html_() == f"<pre>{result.coverage}</pre>"
 
 
 def test_long_things_are_cut():
