@@ -38,7 +38,7 @@ class Page {
     this.seed = 1;
     this.smooth = data.map !== null && data.map.kind === "ode";
     const d = this.cells.axes.length;
-    this.view = { axes: d === 1 ? [0] : [0, 1], at: this.middle() };
+    this.view = { axes: d === 1 ? [0] : [0, 1], at: this.middle(), gather: "" };
   }
 
   // The cell at the middle of the attractor, or of the box: slices pass through it.
@@ -112,6 +112,13 @@ class Page {
           this.draw();
         }));
       });
+    }
+    if (axes.length > 2) {
+      bar.append(this.choice("others", ["slice", "largest", "mean"],
+        ["", "largest", "mean"].indexOf(this.view.gather), (k) => {
+          this.view.gather = ["", "largest", "mean"][k];
+          this.draw();
+        }));
     }
     axes.forEach((axis, k) => { if (!this.view.axes.includes(k)) bar.append(this.slider(axis, k)); });
     if (!this.follower.able) return;
@@ -287,9 +294,10 @@ class Page {
     const run = this.follower.run(x, MOST_STEPS, this.seed++);
     this.runs = [...this.runs.slice(-11), run];
     const cost = run.outcome === "reached A" ? `; cost ${short(run.cost)}` : "";
+    const n = run.controls.length;
     const became = run.outcome === null ? "still going" : run.outcome;
     this.list("run", [["run from", x.map((v) => short(Number(v.toPrecision(4)))).join(", ")],
-      ["it", `${became} after ${run.controls.length} steps${cost}`]]);
+      ["it", `${became} after ${n} step${n === 1 ? "" : "s"}${cost}`]]);
     if (draw) this.draw();
   }
 

@@ -15,7 +15,7 @@ from lmdsl.report.texts import text
 
 # What the script reads; the rest is written out as HTML.
 READ = ("cells", "map", "samples", "rows", "starts", "loop", "survival")
-SCRIPTS = ("follow.js", "pictures.js", "curves.js", "page.js")
+SCRIPTS = ("follow.js", "slices.js", "pictures.js", "curves.js", "page.js")
 
 
 def page(data: dict[str, Any], library: str) -> str:

@@ -53,66 +53,13 @@ function grey(light) {
   return `rgb(${level},${level},${level})`;
 }
 
-// The slice of the grid that is drawn: one or two axes, the others held at an index.
-class Slice {
-  constructor(said, cells, held, view) {
-    Object.assign(this, { said, cells, held, view });
-    this.flat = view.axes.length === 1;
-    this.sizes = [said.drawn[view.axes[0]], this.flat ? 1 : said.drawn[view.axes[1]]];
-    this.strides = said.drawn.map((_, k) => said.drawn.slice(k + 1).reduce((n, m) => n * m, 1));
-  }
-
-  edges(k) {
-    const axis = this.cells.axes[k], step = this.said.step, found = [];
-    for (let j = 0; j < this.said.drawn[k]; j++) found.push(axis.low + j * step * axis.width);
-    return [...found, axis.high];
-  }
-
-  // The position of a cell, by its index, among the drawn ones.
-  drawn(index) {
-    return index.reduce((sum, n, k) => sum
-      + Math.min(Math.floor(n / this.said.step), this.said.drawn[k] - 1) * this.strides[k], 0);
-  }
-
-  status(index) {
-    return this.held.status[this.said.whole ? this.cells.flat(index) : this.drawn(index)];
-  }
-
-  // A value for each drawn cell, rows from below; `of` knows its position and that of its cell.
-  map(of) {
-    const { step } = this.said, [a, b] = this.view.axes, rows = [], held = [...this.view.at];
-    const first = (k) => Math.min(step >> 1, this.cells.axes[k].cells - 1);
-    held[a] = first(a);
-    if (!this.flat) held[b] = first(b);
-    const cell = this.cells.flat(held), place = this.drawn(held);
-    for (let j = 0; j < this.sizes[1]; j++) {
-      const row = new Array(this.sizes[0]);
-      const up = this.flat ? [0, 0] : [j * this.strides[b], j * step * this.cells.strides[b]];
-      for (let i = 0; i < row.length; i++) {
-        row[i] = of(place + up[0] + i * this.strides[a],
-          cell + up[1] + i * step * this.cells.strides[a]);
-      }
-      rows.push(row);
-    }
-    return rows;
-  }
-
-  statuses() {
-    const { status } = this.held;
-    return this.said.whole ? this.map((_, cell) => status[cell]) : this.map((at) => status[at]);
-  }
-
-  x() { return this.edges(this.view.axes[0]); }
-  y() { return this.flat ? [0, 1] : this.edges(this.view.axes[1]); }
-}
-
 function regionTraces(slice) {
   const codes = [1, ...slice.said.regions.map((region) => region.code)];
   const t = theme(), n = codes.length;
   const colours = [t.panel, ...slice.said.regions.map((region) => grey(region.light))];
   const scale = colours.flatMap((colour, k) => [[k / n, colour], [(k + 1) / n, colour]]);
   const place = new Map(codes.map((code, k) => [code, k]));
-  const z = slice.statuses().map((row) => row.map((code) => place.get(code) || 0));
+  const z = slice.statuses(STABILIZED).map((row) => row.map((code) => place.get(code) || 0));
   const y = slice.flat ? "y2" : "y";
   const traces = [{ type: "heatmap", x: slice.x(), y: slice.y(), z, yaxis: y, zmin: -0.5,
     zmax: n - 0.5, colorscale: scale, showscale: false, hoverinfo: "none" }];
@@ -143,7 +90,7 @@ function hatch(slice, wanted, z) {
 
 function outlineTraces(slice) {
   const x = slice.x(), y = slice.y(), lines = [[], []], t = theme();
-  const inside = slice.statuses();
+  const inside = slice.statuses(ATTRACTOR);
   const at = (i, j) => !!inside[j] && inside[j][i] === ATTRACTOR;
   const push = (a, b, c, d) => { lines[0].push(a, c, null); lines[1].push(b, d, null); };
   for (let j = 0; j <= inside.length; j++) {
@@ -160,7 +107,7 @@ function outlineTraces(slice) {
 
 function valueTraces(slice, layer, values) {
   const t = theme();
-  const raw = slice.map((at) => values[at]);
+  const raw = slice.values(values);
   if (slice.flat) {
     const x = slice.x(), centres = x.slice(1).map((b, i) => (b + x[i]) / 2);
     return [{ type: "scatter", mode: "lines", x: centres, y: raw[0], hoverinfo: "skip",
@@ -228,7 +175,8 @@ function groundTraces(slice, layer, values) {
 
 function drawMap(slice, layer, ground, runs, smooth) {
   const [a, b] = slice.view.axes, axes = slice.cells.axes;
-  const shape = { title: headed(layer.title),
+  const how = slice.view.gather ? `, ${slice.view.gather} over the other axes` : "";
+  const shape = { title: headed(layer.title + how),
     xaxis: { title: { text: axes[a].name }, range: [axes[a].low, axes[a].high], showgrid: false,
       zeroline: false }, uirevision: slice.view.axes.join() };
   if (slice.flat) {

@@ -105,6 +105,33 @@ def test_sliders_move_the_slice(pages, solved):
         assert np.array_equal(drawn == 0, status[:, :, int(at)] == 1)
 
 
+def test_the_other_axes_are_put_together(pages, solved):
+    """The largest and the mean over z, of the cost where there is any; regions likewise."""
+    result = solved("lorenz")
+    said = asked(
+        pages("lorenz"),
+        """const others = [...document.querySelectorAll("#controls select")].pop(), found = [];
+        for (const k of [1, 2]) {
+          others.value = k;
+          others.dispatchEvent(new Event("change"));
+          await wait(300);
+          found.push(document.getElementById("map").data.filter((t) => t.type === "heatmap")
+            .map((t) => t.z.map((row) => Array.from(row))));
+        }
+        return found;""",
+    )
+    shape = result.partition.shape
+    on = (result.cell_status == 1).reshape(shape)
+    value = np.where(on, result.value.reshape(shape), np.nan)
+    some = on.any(axis=2)
+    for (codes, drawn), put in zip(said, (np.nanmax, np.nanmean), strict=True):
+        assert np.array_equal(np.array(codes).T == 0, some)
+        found = np.array(drawn, dtype=float).T
+        assert np.array_equal(np.isfinite(found), some)
+        wanted = [put(x[np.isfinite(x)]) for x in value[some]]
+        assert np.allclose(found[some], wanted, rtol=1e-5)
+
+
 def test_names_do_nothing_in_a_browser(tmp_path):
     problem = made(steps()).replaced(name=EVIL)
     lm.solve(problem).report(tmp_path / "a.html")
