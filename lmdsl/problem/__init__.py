@@ -5,6 +5,7 @@ from typing import Any, TypeVar, overload
 
 from lmdsl.common import inputs
 from lmdsl.common.types import FilePath
+from lmdsl.errors import BadInput, shown
 from lmdsl.problem.axes import Axis
 from lmdsl.problem.controls import ControlRange, ControlValues
 from lmdsl.problem.local_control import ConstantControl, LinearFeedback, LqrFeedback
@@ -38,6 +39,9 @@ def given(problem: Any, compiled: Any = None) -> Any:
     Where a class of compiled problems is named, one of these is returned as it is.
     """
     if isinstance(problem, str | os.PathLike):
+        if inputs.path(problem, "problem").is_dir():
+            message = "is a directory; of a saved result take lm.Result.load(path).problem"
+            raise BadInput(f"{shown(os.fspath(problem), 200)} {message}", "problem")
         return load(problem)
     kinds = (Problem,) if compiled is None else (Problem, compiled)
     wanted = "a Problem or the path of a problem file"
