@@ -47,9 +47,7 @@ def test_what_is_no_problem_is_refused(verb, tmp_path):
             verb(bad)
     with pytest.raises(lm.BadInput, match=r"nowhere\.json"):
         verb(tmp_path / "nowhere.json")
-    with pytest.raises(
-        lm.BadInput, match=r"is a directory; of a saved result take lm\.Result\.load"
-    ):
+    with pytest.raises(lm.BadInput, match=r"is a directory; of a saved result take lm\.Result"):
         verb(os.fspath(tmp_path))
 
 
