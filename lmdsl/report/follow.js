@@ -138,7 +138,7 @@ class Follower {
   }
 
   named(x, u, w) {
-    const values = {};
+    const values = Object.create(null);  // a state may be called __proto__
     this.names.forEach((name, k) => { values[name] = x[k]; });
     this.controls.forEach((name, k) => { values[name] = u[k]; });
     this.map.noise.forEach(({ name }, k) => { values[name] = w[k]; });
@@ -177,7 +177,7 @@ class Follower {
   // A sampling time of an equation: classical Runge-Kutta steps, and the first event on their way.
   integrated(x, values) {
     const { h, substeps, integrals, path, absorb } = this.map, d = x.length;
-    const held = { ...values };
+    const held = Object.assign(Object.create(null), values);
     const slope = (at) => {
       this.names.forEach((name, k) => { held[name] = at[k]; });
       return this.program(held);

@@ -211,5 +211,6 @@ def _repeat(result: Result, asked: Beside, seed: int) -> dict[str, Any]:
         "versions": versions(),
         "made_by": dict(asked.made_by or {}),
         "directory": asked.directory,
+        "fresh": result.lp is not None,
         "seed": seed,
     }

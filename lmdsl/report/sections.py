@@ -71,12 +71,12 @@ def heading(data: PlainData) -> str:
 
 def _checked(data: PlainData) -> str:
     """Return whether the claims were checked for this page."""
-    found, where = data["verification"], data["repeat"]["directory"]
+    found = data["verification"]
     if found is None:
-        if not where:
+        if data["repeat"]["fresh"]:
             return "<p class='note'>The claims were checked when the result was found.</p>"
         return (
-            "<p class='note'>Claims are quoted as the directory states them; they were not "
+            "<p class='note'>Claims are quoted as the saved result states them; they were not "
             "checked again for this page. <code>lmdsl verify</code> checks them.</p>"
         )
     if found["holds"]:

@@ -83,6 +83,25 @@ def test_costs_of_runs_are_those_of_the_model():
 
 
 @node
+@pytest.mark.parametrize("kind", ["map", "ode"])
+def test_names_that_objects_have_are_names_of_states(kind):
+    """JavaScript knows __proto__ and constructor of every object."""
+    names = ("__proto__", "constructor", "u")
+    image = {"__proto__": "__proto__ - 0.25*u", "constructor": "constructor"}
+    rate = {"__proto__": "-0.25*u", "constructor": "0*constructor"}
+    system = {"map": {"kind": "map", "next": image},
+              "ode": {"kind": "ode", "derivative": rate, "step": 1.0}}[kind]  # fmt: skip
+    box = {name: {"low": 0, "high": 1, "cells": 4} for name in names[:2]}
+    result = lm.solve(made(steps(system=system, state_box=box,
+                                 attractor={"boxes": [{"__proto__": [0, 0.25]}]})))  # fmt: skip
+    data = told(result)
+    for start, run in zip(data["starts"], followed(data, RUN), strict=True):
+        path = result.closed_loop.path(start, 60, as_compiled=True)
+        assert np.allclose(run["states"], path)
+        assert run["outcome"] == "reached A"
+
+
+@node
 def test_samples_go_where_the_rows_say(solved):
     result = solved("maze")
     data, lp = told(result), result.lp

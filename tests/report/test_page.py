@@ -240,6 +240,9 @@ def test_a_loaded_result_is_compiled_for_its_spectrum(solved, tmp_path, library)
     a, b = (json.loads(Read((tmp_path / x).read_text()).scripts[0]) for x in ("a.html", "b.html"))
     assert a["loop"] is not None
     assert a["loop"] == b["loop"]
+    first, second = (Read((tmp_path / x).read_text()).text for x in ("a.html", "b.html"))
+    assert "The claims were checked when the result was found" in first
+    assert "quoted as the saved result states them" in second
 
 
 def two_basins():
@@ -286,7 +289,7 @@ def test_the_command(capsys, tmp_path, solved, library):
     assert status == 0
     assert said == f"written to {out}/report.html (the result as stored, not re-checked; " \
         "see lmdsl verify)\n"  # fmt: skip
-    assert "quoted as the directory states them" in Read((out / "report.html").read_text()).text
+    assert "quoted as the saved result states them" in Read((out / "report.html").read_text()).text
     assert lm.verify(out).holds
     status, said, _ = run(capsys, "report", out, "--verify", "--backends",
                           "policy-iteration,highs", "--out", tmp_path / "b.html")  # fmt: skip
