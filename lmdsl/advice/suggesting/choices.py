@@ -18,7 +18,7 @@ NEAR = math.log(4 / 3)  # how far, in logarithms, from what is aimed at a number
 FAR = 0.5  # what that distance counts beside the part of the attractor that is lost
 MORE = 1.2  # how many times the cells aimed at a choice may have
 # Samples in a cell up to which a sampling is tried, and the times of the usual one up to which.
-FEW_SAMPLES, TIMES = 16, 3
+FEW_SAMPLES, TIMES = 16, 6
 GRIDS, CORNERS = range(1, 5), 32  # grids tried; corners up to which a cell's are sampled
 
 

@@ -14,6 +14,7 @@ from lmdsl.results.result import Result
 from lmdsl.results.solving import solve
 
 STARTS = 400  # runs of each
+BROKEN = 4  # how many times a run counts that does not arrive
 # Step limit of the runs: times as many as the longest way to A has at least, within two bounds.
 LONGER, LEAST_STEPS, MOST_STEPS = 10, 200, 2_000
 
@@ -31,8 +32,8 @@ class Attempt(Reported):
     arrives
         Share of runs of the true map from these that arrive; None where there is no controller.
     score
-        Of what is not avoided, the part that is in the attractor or, times the square of the
-        share that arrives, stabilizable: a promise that is broken counts twice.
+        Of what is not avoided, the part that is in the attractor or, times the fourth power of
+        the share that arrives, stabilizable: a promise that is broken counts four times.
     message
         Why there is no such problem, or no controller; else empty.
     """
@@ -121,5 +122,5 @@ def score(result: Result, arrives: float) -> float:
     status = result.cell_status
     whole = len(status) - int((status == CellStatus.AVOID).sum())
     attractor = int((status == CellStatus.ATTRACTOR).sum())
-    served = attractor + int((status == CellStatus.STABILIZED).sum()) * arrives**2
+    served = attractor + int((status == CellStatus.STABILIZED).sum()) * arrives**BROKEN
     return served / whole if whole and math.isfinite(served) else 0.0

@@ -22,6 +22,7 @@ from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.assembly import estimates
+from lmdsl.model.assembly.substeps import settled
 from lmdsl.problem import Problem, given
 from lmdsl.problem.local_control import without_orbit
 from lmdsl.systems import MatrixSystem
@@ -103,8 +104,9 @@ def suggest(
                        "problem")  # fmt: skip
     deadline = Deadline.of(time_limit)
     base = _comparable(problem)
-    few = _few_controls(base)
-    factor = _affordable(few)
+    most = _controls(settled(base, deadline))
+    few = choices.thinned(base, most)
+    factor = _affordable(choices.thinned(settled(base, deadline), most))
     trials = _Trials(few, deadline, progress)
     start = choices.own(base).scaled(factor)._replace(step=choices.own(base).step)
     before = trials(start)
@@ -124,13 +126,13 @@ def _comparable(problem: Problem) -> Problem:
     )
 
 
-def _few_controls(problem: Problem) -> Problem:
-    """Return the problem with as many of its controls as a trial of its cells can have."""
+def _controls(problem: Problem) -> int:
+    """Return how many of its controls a trial of all cells of a problem can have."""
     usual = problem.replaced(sampling=choices.usual(problem))
     for most in CONTROLS:
         if sizes.work(choices.thinned(usual, most)) <= TRIAL:
             break
-    return choices.thinned(problem, most)
+    return most
 
 
 def _affordable(problem: Problem) -> float:
@@ -186,7 +188,7 @@ def _decided(
     scaled = best.choice.scaled(1 / factor)
     asked = [best.choice, scaled._replace(step=best.choice.step), scaled]
     asked = [choice.rounded() for choice in asked]
-    asked = [choice for i, choice in enumerate(asked) if choice not in asked[:i]]
+    asked = list({str((c.step, c.cells(base), c.sampling)): c for c in asked}.values())
     before, finals = trials(start), [Best(best.choice, best.pilot)]
     whole = all(_cheap(choice.of(base)) for choice in (choices.own(base), *asked))
     if whole:
@@ -231,8 +233,8 @@ def _reasons(problem: Problem, pilots: list[Attempt], best: Best, changed: Probl
     """Return why each part is as it is: what becomes of its neighbours."""
     pilot = best.pilot
     found = [
-        "trials are judged by the share of the box that is stabilizable times the square of the "
-        "share of its runs on the true map that arrive"
+        "trials are judged by the share of the box that is stabilizable times the fourth power of "
+        "the share of its runs on the true map that arrive"
     ]
     parts: list[tuple[str, Any, Callable[[Attempt], str]]] = [
         ("step", pilot.step, lambda p: f"a step of {p.step:.3g}"),
