@@ -45,7 +45,7 @@ def test_they_run(path):
     stored = nbformat.read(path, as_version=4)
     ran = nbformat.read(path, as_version=4)
     here = {"metadata": {"path": path.parent}}
-    nbclient.NotebookClient(ran, resources=here, timeout=120).execute()
+    nbclient.NotebookClient(ran, resources=here, timeout=300).execute()
     for was, now in zip(stored.cells, ran.cells, strict=True):
         if was.cell_type == "code":
             assert kinds(now) >= kinds(was)
