@@ -46,7 +46,10 @@ class Page {
     if (this.said.whole) {
       const found = [];
       this.held.status.forEach((code, i) => { if (code === ATTRACTOR) found.push(i); });
-      if (found.length) return this.cells.index(found[found.length >> 1]);
+      const all = found.map((cell) => this.cells.index(cell));
+      const mean = this.cells.axes.map((_, k) => all.reduce((s, i) => s + i[k], 0) / all.length);
+      const away = (index) => index.reduce((s, i, k) => s + Math.abs(i - mean[k]), 0);
+      if (all.length) return all.reduce((best, i) => (away(i) < away(best) ? i : best));
     }
     return this.cells.axes.map((axis) => axis.cells >> 1);
   }

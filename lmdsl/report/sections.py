@@ -136,7 +136,8 @@ def pictures(data: PlainData) -> str:
         if data["rows"] is None:
             how = ""
     elif data["map"]["kind"] == "ode":
-        how = f"this page makes {data['map']['substeps']} Runge-Kutta steps per sampling time"
+        n = data["map"]["substeps"]
+        how = f"this page makes {n} Runge-Kutta step{'s' * (n != 1)} per sampling time"
     click = f" Click, tap or press one of the buttons to start a closed-loop run: {how}." if how \
         else ""  # fmt: skip
     step = data["cells"]["step"]
