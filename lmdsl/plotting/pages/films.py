@@ -29,7 +29,7 @@ def gif(frames: list[Pixels], fps: int) -> bytes:
     colours = palette(frames)
     pages = []
     for index in indexed(frames, colours):
-        page = Image.fromarray(index, mode="P")
+        page = Image.fromarray(index)
         page.putpalette(colours.tobytes())
         pages.append(page)
     each = max(round(1000 / fps), 10)
