@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from problems import made, steps
 
 import lmdsl as lm
-from lmdsl.advice.suggesting import choices, pilots, search
+from lmdsl.advice.suggesting import choices, pilots, reasons, search
 
 BOX = {"x": {"low": -1, "high": 1, "cells": 10}, "v": {"low": -1, "high": 1, "cells": 10}}
 
@@ -72,7 +72,10 @@ def test_a_step_that_is_too_short_is_lengthened(braked):
     # What is told of it is what solve says, on as many cells.
     assert found.after.coverage == after[0]
     assert found.before.coverage == before[0]
-    assert "all else the same" in found.reasons[1]
+    step, cells, samples = found.reasons[1:4]
+    assert step.startswith("a step of")
+    assert cells.startswith("cells")
+    assert "an axis" in samples
     assert '"step"' in str(found)
     assert "as suggested" in found._repr_html_()
 
@@ -99,6 +102,18 @@ def test_what_serves_already_is_left_as_it_is(data):
     assert found.problem == made(data)
     assert found.changes == {}
     assert "nothing better" in found.text()
+
+
+def test_a_neighbour_that_was_not_tried_is_looked_for_beside_the_best_alike():
+    def attempt(step, cells, score):
+        return pilots.Attempt(step, {"x": cells}, {"kind": "grid", "per_axis": 2}, 0.5, 0.8, score)
+
+    tried = [attempt(0.1, 8, 0.2), attempt(0.2, 8, 0.3), attempt(0.2, 16, 0.4)]
+    told = reasons.reasons(made(brake()), tried, tried[2], made(brake()))
+    step = "a step of 0.2 with cells 8, 2 samples an axis (coverage 50 %, 80 % arrive)"
+    assert told[1].startswith(step)
+    assert told[1].endswith("a step of 0.1: coverage 50 %, 80 % arrive")
+    assert told[2].startswith("cells 16 (coverage")
 
 
 def test_the_same_is_suggested_again():

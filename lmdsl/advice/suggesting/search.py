@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 from lmdsl.advice import sizes
 from lmdsl.advice.suggesting import choices
 from lmdsl.advice.suggesting.choices import Combination
-from lmdsl.advice.suggesting.pilots import Attempt, sampling_words, tried
+from lmdsl.advice.suggesting.pilots import Attempt, tried
+from lmdsl.advice.suggesting.reasons import reasons
 from lmdsl.advice.suggesting.report import Suggestion, changes
 from lmdsl.common.types import FilePath, Progress
 from lmdsl.errors import BadInput
@@ -35,7 +36,6 @@ LEAST = 200  # number of cells that a trial has at least
 GAIN = 1.03  # by how much a better choice is better
 ENOUGH = 0.98  # score above which nothing better is looked for
 STEPS = (0.25, 0.5, 1, 2, 4, 8)  # times the declared step
-SURE = 0.9  # share that arrives from which on a trial is told where the best one has less
 
 
 class Best(NamedTuple):
@@ -210,7 +210,7 @@ def _decided(
         before=before,
         after=final.pilot if better else before,
         whole=whole,
-        reasons=tuple(_reasons(problem, known, best, changed)) if better else (),
+        reasons=tuple(reasons(problem, known, best.pilot, changed)) if better else (),
         pilots=tuple(known),
         cut=trials.cut,
     )
@@ -227,46 +227,3 @@ def _written(problem: Problem, base: Problem, choice: Combination) -> Problem:
         kept = None  # a weight for each cell fits no other cells
     own = problem.replaced(attractor=base.attractor, measure=kept)
     return choice.of(own)
-
-
-def _reasons(problem: Problem, pilots: list[Attempt], best: Best, changed: Problem) -> list[str]:
-    """Return why each part is as it is: what becomes of its neighbours."""
-    pilot = best.pilot
-    found = [
-        "trials are judged by the share of the box that is stabilizable times the fourth power of "
-        "the share of its runs on the true map that arrive"
-    ]
-    parts: list[tuple[str, Any, Callable[[Attempt], str]]] = [
-        ("step", pilot.step, lambda p: f"a step of {p.step:.3g}"),
-        ("cells", pilot.cells, lambda p: f"cells {'x'.join(map(str, p.cells.values()))}"),
-        ("sampling", pilot.sampling, lambda p: sampling_words(p.sampling)),
-    ]
-    for name, value, words in parts:
-        others = [
-            p
-            for p in pilots
-            if p is not pilot
-            and getattr(p, name) != value
-            and all(getattr(p, k) == getattr(pilot, k) for k, _, _ in parts if k != name)
-        ]
-        others.sort(key=lambda p: -p.score)
-        if others:
-            told = "; ".join(f"{words(p)}: {_became(p)}" for p in others[:3])
-            found.append(f"{words(pilot)} ({_became(pilot)}), all else the same: {told}")
-    surer = [p for p in pilots if p.arrives is not None and p.arrives >= SURE and p.coverage]
-    if surer and (pilot.arrives or 0.0) < SURE:
-        widest = max(surer, key=lambda p: p.coverage or 0.0)
-        found.append(f"surer, of the trials: {widest}")
-    longer = getattr(problem.system, "step", None) != getattr(changed.system, "step", None)
-    if longer and problem.cost_rate is None:
-        found.append("stage_cost is paid in each step: with another step it is another cost; "
-                     "a cost_rate is not")  # fmt: skip
-    if problem.measure is not None and changed.measure is None:
-        found.append("measure.weights, one for each cell, were left out: write them anew")
-    return found
-
-
-def _became(pilot: Attempt) -> str:
-    if pilot.coverage is None or pilot.arrives is None:
-        return "nothing can be stabilized" if pilot.coverage is not None else "no such problem"
-    return f"coverage {100 * pilot.coverage:.3g} %, {100 * pilot.arrives:.3g} % arrive"
