@@ -27,6 +27,11 @@ def spoken(seconds: float) -> str:
     return f"{seconds / 86400:.0f} days"
 
 
+def family(stage: str) -> str:
+    """Return the name of a stage, without what changes as it goes on."""
+    return stage.split(",")[0].split(" (")[0]
+
+
 class Pace:
     """How fast a stage goes, and how long it will take at this rate."""
 
@@ -36,7 +41,7 @@ class Pace:
 
     def left(self, stage: str, fraction: float) -> float | None:
         """Return seconds left of a stage; None where that is not known, or too early to say."""
-        now, name = self.clock(), stage.split(",")[0]
+        now, name = self.clock(), family(stage)
         if name != self.stage or fraction < self.last:  # it begins, or begins again
             self.stage, self.began, self.first = name, now, max(fraction, 0.0)
         self.last = max(fraction, 0.0)
@@ -62,7 +67,7 @@ class ProgressLine:
 
     def __call__(self, stage: str, fraction: float) -> None:
         """Show a stage and the fraction done (-1: unknown)."""
-        left, name = self.pace.left(stage, fraction), stage.split(",")[0]
+        left, name = self.pace.left(stage, fraction), family(stage)
         now, over = self.clock(), self.terminal or self.notebook
         rarely = OFTEN if over else SELDOM
         if not self.shown or (name == self.stage and now - self.last < rarely):
@@ -112,7 +117,7 @@ class Forecast:
         spent = max(self.clock() - self.began, 1e-9)
         whole = self.limit
         if stage == "prove":
-            stage = f"prove, {100 * fraction:.4g} % decided"
+            stage = f"prove ({100 * fraction:.4g} % decided)"
             self.seen.append((spent, max(1.0 - fraction, 1e-12)))
             expected = self._whole()
             whole = expected if whole is None or (expected and expected < whole) else whole

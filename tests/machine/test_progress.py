@@ -61,7 +61,7 @@ def test_what_changes_in_a_stage_begins_no_new_one():
     clock = Clock()
     pace = Pace(clock)
     for k in range(5):
-        left = pace.left(f"prove, {k} % decided", k / 8)
+        left = pace.left(f"prove ({k} % decided)", k / 8)
         clock.now += 3
     assert left == pytest.approx(12.0)
 
@@ -122,7 +122,7 @@ def test_a_time_limit_ends_a_forecast():
     clock.now += 4
     tell("refine", -1.0)
     assert told == [
-        ("prove, 50 % decided", 0.4), ("prove, 50 % decided", 0.8), ("tighten", 0.8),
+        ("prove (50 % decided)", 0.4), ("prove (50 % decided)", 0.8), ("tighten", 0.8),
         ("refine", 1.0),
     ]  # fmt: skip
 
@@ -158,7 +158,7 @@ def test_true_shows_the_progress_of_every_long_call(capsys, tmp_path):
         (lambda p: lm.check(made(steps()), progress=p), "check"),
         (lambda p: lm.explain(lp.problem, progress=p), "explain"),
         (lambda p: lm.compare(lp, ["policy-iteration"], progress=p), "solve"),
-        (lambda p: lm.solve(made(steps())).prove(progress=p), "prove, 0 % decided"),
+        (lambda p: lm.solve(made(steps())).prove(progress=p), "prove (0 % decided)"),
     ):
         call(True)
         assert f"lmdsl: {word}" in capsys.readouterr().err
