@@ -3,7 +3,9 @@
 import contextlib
 import errno
 import json
+import math
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterable
@@ -141,13 +143,30 @@ def strict_json(content: bytes, null: bool = False) -> Any:
             parse_constant=lambda word: _Flaw(f"{word} is not a number of JSON; use a finite one"),
         )
     except json.JSONDecodeError as error:
-        raise BadInput(
-            f"not JSON: {error.msg} (line {error.lineno}, column {error.colno})"
-        ) from None
+        where = f"(line {error.lineno}, column {error.colno})"
+        raise BadInput(f"not JSON: {error.msg} {where}{_remedy(text, error.pos)}") from None
     except RecursionError:
         raise BadInput(f"nested deeper than {MAX_NESTING} levels") from None
     _refuse_faults(data, "", null)
     return data
+
+
+def _remedy(text: str, at: int) -> str:
+    """Return what is to be written instead, where JSON ends to be JSON."""
+    rest, before = text[at : at + 40], text[:at].rstrip()
+    if rest[:1] == "#" or rest[:2] in ("//", "/*"):
+        return "; JSON has no comments: leave them out"
+    if rest[:1] == "'":
+        return '; write text in "double quotes"'
+    if before.endswith(",") and rest[:1] in ("}", "]"):
+        return f"; leave out the comma before {rest[0]}"
+    digits = "; numbers are written in digits"
+    word = re.match(r"[-+]?\s*(pi|tau|e)\b", rest) or re.match(r"\s*\*\s*(pi|tau|e)\b", rest)
+    if word:
+        return f"{digits}: {word[1]} is {getattr(math, word[1])!r}"
+    if at and re.match(r"[-+.*/^A-Za-z_]", rest):
+        return f'{digits}, formulas in "double quotes", true and false in small letters'
+    return ""
 
 
 def _integer(digits: str) -> Any:
