@@ -170,7 +170,7 @@ def test_folders_that_are_no_study_are_refused_before_work(tmp_path):
     (key,) = good["rows"]
     for name, value in (
         ("status", 3), ("cost", "free"), ("cells", {"x": True}), ("interval", [1]),
-        ("pairs", 1.5), ("gamma", None), ("cells", {}),
+        ("pairs", 1.5), ("gamma", None), ("cells", {}), ("step", "inf"), ("time", "inf"),
     ):  # fmt: skip
         spoiled = json.loads(json.dumps(good))
         spoiled["rows"][key][name] = value
@@ -183,6 +183,27 @@ def test_folders_that_are_no_study_are_refused_before_work(tmp_path):
         file.write_text(text)
         with pytest.raises(lm.BadInput):
             lm.study(made(ODE), out=tmp_path / "s", starts=0)
+
+
+def test_a_row_that_was_put_under_another_variant_is_not_believed(tmp_path):
+    asked = {"cells": [8, 16], "out": tmp_path / "s", "starts": 0}
+    good = lm.study(made(ODE), **asked)
+    file = tmp_path / "s/study.json"
+    data = json.loads(file.read_text())
+    first, second = data["rows"]
+    data["rows"][first], data["rows"][second] = data["rows"][second], data["rows"][first]
+    data["rows"][first]["cost"] = "inf"
+    file.write_text(json.dumps(data))
+    again = lm.study(made(ODE), **asked)
+    assert [r.cost for r in again.rows] == [r.cost for r in good.rows]
+
+
+def test_an_infinite_cost_is_kept(tmp_path):
+    folder = keeping.Folder(tmp_path, {})
+    folder.add("0" * 64, row(cost=np.inf, gap=np.inf), None)
+    (found,) = keeping.Folder(tmp_path, {}).rows.values()
+    assert found == row(cost=np.inf, gap=np.inf)
+    assert "inf" in record.Study("x", (found,)).table()
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import csv
 import hashlib
 import io
 import json
+import math
 import os
 from dataclasses import fields
 from pathlib import Path
@@ -23,6 +24,7 @@ from lmdsl.results.result import Result
 FORMAT = "lmdsl-study/1"
 NAME, VARIANTS = "study.json", "variants"
 DIGITS = 16  # of the key in the name of a directory
+MAY_BE_INFINITE = ("cost", "gap")  # fields whose infinity stands as text in the file
 
 
 class Folder:
@@ -97,13 +99,15 @@ def _row(data: Any, where: str) -> StudyRow:
     if isinstance(found["interval"], list):
         found["interval"] = tuple(found["interval"])
     for name in names:
-        if not _fits(found[name], kinds[name]):
+        if not _fits(name, found[name], kinds[name]):
             raise BadInput(f"{shown(found[name])} is not accepted", f"{where}.{name}")
+    for name in MAY_BE_INFINITE:
+        found[name] = math.inf if found[name] == "inf" else found[name]
     return StudyRow(**found)
 
 
-def _fits(value: Any, kind: Any) -> bool:
-    """Return whether plain data fit the type of a field."""
+def _fits(name: str, value: Any, kind: Any) -> bool:
+    """Return whether plain data fit a field and its type."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if kind == dict[str, int]:
         return isinstance(value, dict) and bool(value) and all(
@@ -119,5 +123,5 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind is float:
         return number
     if kind == float | None:
-        return value is None or number or value == "inf"
+        return value is None or number or (value == "inf" and name in MAY_BE_INFINITE)
     return value is None or (isinstance(value, int) and not isinstance(value, bool))

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from lmdsl import backends
+from lmdsl.advice.studies.record import StudyRow
 from lmdsl.common import inputs
 from lmdsl.errors import BadInput, shown
 from lmdsl.explanation.remedies import with_cells
@@ -36,6 +37,10 @@ class Variation(NamedTuple):
     step: float | None
     gamma: float
     backend: str
+
+    def is_of(self, row: StudyRow) -> bool:
+        """Return whether a row is one of this variant."""
+        return all(getattr(row, name) == value for name, value in self._asdict().items())
 
     def of(self, problem: Problem) -> Problem:
         """Return the problem in this variant, but for gamma.

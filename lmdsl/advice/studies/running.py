@@ -114,9 +114,10 @@ class _Work:
             problem = asked.of(self.problem).replaced(gamma=asked.gamma)
             if self.folder is not None:
                 key = self.folder.key(problem, asked.backend)
-                if key in self.folder.rows:
+                kept = self.folder.rows.get(key)
+                if kept is not None and asked.is_of(kept):
                     self.last = key
-                    return self.folder.rows[key]
+                    return kept
             result = self._solved(problem, asked)
         except BadInput as error:
             return StudyRow(**asked._asdict(), status="bad_input", message=str(error))
