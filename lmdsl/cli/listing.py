@@ -8,6 +8,7 @@ from typing import Any
 from lmdsl.cli.output import Arguments, Command, print_json, shared
 from lmdsl.cli.streams import say
 from lmdsl.common import spelling
+from lmdsl.common.optional import installed
 from lmdsl.errors import BadInput, printable, shown
 
 
@@ -120,7 +121,7 @@ def _completion(parsed: Arguments) -> int:
     try:
         import shtab
     except ImportError:
-        message = 'shtab is not installed; pip install "lmdsl[completion]"'
+        message = f"shtab is not installed: {installed('completion')}"
         raise BadInput(message, "completion") from None
     if parsed.shell not in shtab.SUPPORTED_SHELLS:
         known = ", ".join(shtab.SUPPORTED_SHELLS)

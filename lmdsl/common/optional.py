@@ -6,6 +6,11 @@ from typing import Any
 from lmdsl.errors import MissingDependency
 
 
+def installed(extra: str) -> str:
+    """Return the commands that install what an extra names."""
+    return f'pip install "lmdsl[{extra}]" (in a clone: pip install -e ".[{extra}]")'
+
+
 def needed(package: str, what: str, extra: str) -> Any:
     """Import an optional package.
 
@@ -17,6 +22,4 @@ def needed(package: str, what: str, extra: str) -> Any:
     try:
         return import_module(package)
     except ImportError:
-        raise MissingDependency(
-            f"{what} needs the package {package}; pip install 'lmdsl[{extra}]'"
-        ) from None
+        raise MissingDependency(f"{what} needs the package {package}: {installed(extra)}") from None

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from lmdsl.common import inputs
 from lmdsl.common.files import open_regular, reason
+from lmdsl.common.optional import installed
 from lmdsl.common.types import Floats
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
@@ -177,7 +178,7 @@ def _parquet(file: BinaryIO) -> dict[str, NDArray[Any]]:
         from pyarrow import parquet
     except ImportError:
         raise BadInput(
-            "Parquet needs pyarrow: pip install 'lmdsl[data]', or convert it to CSV"
+            f"Parquet needs pyarrow: {installed('data')}; or convert it to CSV"
         ) from None
     try:
         found = parquet.ParquetFile(file)

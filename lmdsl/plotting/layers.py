@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from lmdsl.common.optional import installed
 from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput, MissingDependency, shown
 from lmdsl.plotting.view import View, number
@@ -39,7 +40,7 @@ def blank(columns: float = 1, rows: float = 1) -> Any:
 
         from lmdsl.plotting.shown import Picture, offer
     except ImportError:
-        raise MissingDependency('plots need matplotlib: pip install "lmdsl[plot]"') from None
+        raise MissingDependency(f"plots need matplotlib: {installed('plot')}") from None
     except ValueError:
         backend = shown(os.environ.get("MPLBACKEND"))
         raise BadInput(

@@ -167,6 +167,14 @@ def _runs(result: Result) -> Iterator[ClaimRow]:
         yield _row(EVIDENCE, runs.followed, "They cost, in the mean", f"{_known(mean, 6)}{spread}")
 
 
+def _share(proof: Proof, claim: str, share: float) -> ClaimRow:
+    """Return what is proved of a share: what is undecided may belong to it, too."""
+    if proof.undecided == 0:
+        return _row(PROVED, TRUE, claim, percent(share, 6))
+    figure = f"at least {percent(share, 6)}; {percent(proof.undecided, 6)} is undecided"
+    return _row(_worth(share > 0), TRUE, claim, figure)
+
+
 def _proof(result: Result, proof: Proof | None) -> Iterator[ClaimRow]:
     if proof is None:
         if result.verified and not isinstance(result.problem.system, MatrixSystem):
@@ -175,11 +183,10 @@ def _proof(result: Result, proof: Proof | None) -> Iterator[ClaimRow]:
         return
     share = proof.stays if proof.to_stay else proof.arrives
     word = "stays for ever" if proof.to_stay else "arrives in A"
-    yield _row(PROVED, TRUE, f"Share of the volume of the stabilizable set that {word}",
-               percent(share, 6))  # fmt: skip
-    yield _row(PROVED, TRUE, "Share that is lost", percent(proof.lost, 6))
+    yield _share(proof, f"Share of the volume of the stabilizable set that {word}", share)
+    yield _share(proof, "Share that is lost", proof.lost)
     if not proof.to_stay:
-        yield _row(PROVED, TRUE, "Share that stays elsewhere", percent(proof.stays, 6))
+        yield _share(proof, "Share that stays elsewhere", proof.stays)
     yield _row(OPEN, TRUE, "Share that is undecided", percent(proof.undecided, 6))
     if proof.cost is not None:
         low, high = (_known(x, 6) for x in proof.cost)

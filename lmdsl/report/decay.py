@@ -78,8 +78,20 @@ def spectrum(P: Any, deadline: Deadline) -> tuple[float | None, Any, bool]:
     together = together[np.lexsort((-together.imag, -together.real, -np.abs(together).round(12)))]
     complete &= len(large) <= PARTS
     radius = float(np.abs(together).max()) if complete or len(together) > 1 else None
-    shown = together[:LEADING] if np.abs(together).max() else together[:1]
+    shown = _leading(together) if np.abs(together).max() else together[:1]
     return radius, shown, complete
+
+
+def _leading(values: Any) -> Any:
+    """Return the first LEADING of sorted values, and the conjugates of those, which P has too.
+
+    Where Arnoldi's method ends between the two of a pair, it finds one of them.
+    """
+    some = values[:LEADING]
+    near = 1e-6 * np.abs(some)
+    real = np.abs(some.imag) <= near
+    alone = ~real & (np.abs(some[:, None] - some.conj()[None, :]).min(axis=0) > near)
+    return np.concatenate([some, some[alone].conj()])
 
 
 def _eigenvalues(block: Any) -> tuple[Any, bool]:

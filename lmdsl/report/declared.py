@@ -4,7 +4,10 @@ from collections.abc import Collection, Iterable, Mapping
 from itertools import islice
 from typing import Any
 
+import numpy as np
+
 from lmdsl.model.discretization import control_count, sample_points
+from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.consistency.endings import numbered
 from lmdsl.problem.noise import NoiseNormal, NoiseUniform
 from lmdsl.problem.problem import Problem
@@ -25,7 +28,7 @@ DeclaredRow = dict[str, Any]  # ``name``, ``text`` and, where there is mathemati
 def problem_of(result: Result) -> dict[str, Any]:
     """Return what a problem says as plain data: a summary, equations, and a table."""
     problem = result.problem
-    rows = [*_states(problem), *_controls(problem), *_noises(problem), *_sets(problem),
+    rows = [*_states(problem), *_controls(problem), *_noises(problem), *_sets(result),
             *_rest(problem)]  # fmt: skip
     return {
         "summary": _summary(problem),
@@ -85,19 +88,11 @@ def _equations(problem: Problem) -> list[str]:
     system, names, found = problem.system, _names(problem), []
     if isinstance(system, NamedSystem):
         system = system.definition()
-    if isinstance(system, MapSystem):
-        rows = [
-            m.equation(_raised(state), m.shown(system.next[state], names))
-            for state in problem.states
-            if state in system.next
-        ]
-        found.append(m.table(rows[:LONGEST]))
-    elif isinstance(system, OdeSystem):
-        rows = [
-            m.equation(_dotted(state), m.shown(system.derivative[state], names))
-            for state in problem.states
-            if state in system.derivative
-        ]
+    if isinstance(system, MapSystem | OdeSystem):
+        right, left = (
+            (system.next, _raised) if isinstance(system, MapSystem) else (system.derivative, _rate)
+        )
+        rows = [m.equation(left(k), m.shown(right[k], names)) for k in problem.states if k in right]
         found.append(m.table(rows[:LONGEST]))
     else:
         letters = ["x", "u"] if problem.controls else ["x"]
@@ -117,8 +112,10 @@ def _raised(state: str) -> str:
     return f"<msup><mrow>{m.name(state)}</mrow><mo>+</mo></msup>"
 
 
-def _dotted(state: str) -> str:
-    return f'<mover accent="true"><mrow>{m.name(state)}</mrow><mo>˙</mo></mover>'
+def _rate(state: str) -> str:
+    """Return a derivative as a fraction: dots above letters run into them in some browsers."""
+    d = '<mi mathvariant="normal">d</mi>'
+    return f"<mfrac><mrow>{d}{m.name(state)}</mrow><mrow>{d}<mi>t</mi></mrow></mfrac>"
 
 
 def _objective(problem: Problem) -> str:
@@ -186,13 +183,16 @@ def _noises(problem: Problem) -> Iterable[DeclaredRow]:
         yield _row("noise", text, m.block(m.name(name), False))
 
 
-def _sets(problem: Problem) -> Iterable[DeclaredRow]:
+def _sets(result: Result) -> Iterable[DeclaredRow]:
+    problem = result.problem
     if problem.attractor.empty:
         yield _row("attractor A", "none")
     else:
-        yield _row("attractor A", *_set(problem, problem.attractor, "all cells around or inside"))
+        text, *math = _set(problem, problem.attractor, _which(problem.attractor))
+        yield _row("attractor A", f"{_counted(result, CellStatus.ATTRACTOR)}: {text}", *math)
     if problem.avoid is not None:
-        yield _row("avoid Z", *_set(problem, problem.avoid, "all cells that meet"))
+        text, *math = _set(problem, problem.avoid, "all that meet")
+        yield _row("avoid Z", f"{_counted(result, CellStatus.AVOID)}: {text}", *math)
     measure = problem.measure
     if measure is None:
         yield _row("starts m", "every stabilizable cell with the same weight")
@@ -204,6 +204,23 @@ def _sets(problem: Problem) -> Iterable[DeclaredRow]:
     elif measure.weights is not None:
         text += f"; with a weight for each of {len(measure.weights):,} cells"
     yield _row("starts m", text, *math)
+
+
+def _which(attractor: Attractor) -> str:
+    """Return which cells points, boxes and conditions make the attractor."""
+    words = ["those around the points"] if attractor.points else []
+    words += ["those wholly inside a box"] if attractor.boxes else []
+    words += ["those on all of which a condition certainly holds"] if attractor.where else []
+    return ", ".join(words)
+
+
+def _counted(result: Result, status: CellStatus) -> str:
+    """Return how many cells there are of a kind, and how many attractor cells hold."""
+    count = int(np.count_nonzero(result.cell_status == status))
+    text, local = f"{count:,} cell{'s' * (count != 1)}", result.local_controller
+    if status == CellStatus.ATTRACTOR and local is not None and local.holding is not None:
+        return f"{text}, {local.holding:,} of which hold what arrives"
+    return text
 
 
 def _some(measure: Measure) -> bool:
@@ -226,7 +243,7 @@ def _set(problem: Problem, part: Attractor | Avoid | Measure, how: str) -> list[
     for listed in (points, boxes, conditions):
         left += max(len(listed) - MOST, 0)
     cells = len(getattr(part, "cells", ()))
-    words = [how] if math else []
+    words = [how] if math and how else []
     words += [f"{cells:,} cells by their indices"] if cells else []
     words += [f"{left:,} more are not listed here"] if left else []
     return ["; ".join(words), *math]

@@ -194,7 +194,7 @@ def _proving(proof: Proof | None) -> str | None:
     if proof is None:
         return None
     target = "" if proof.target == TARGET else f" --target {proof.target!r}"
-    return target + " --bracket" * (proof.maps is not None)
+    return target + " --bracket" * (proof.nonnegative is not None)
 
 
 def _repeat(result: Result, asked: Beside, seed: int) -> dict[str, Any]:

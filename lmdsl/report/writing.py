@@ -11,6 +11,7 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.files import write_whole
+from lmdsl.common.optional import installed
 from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, LmdslError, MissingDependency, plain_text, shown
 from lmdsl.machine import memory
@@ -149,4 +150,4 @@ def _library() -> str:
         file = Path(place) / "package_data" / "plotly.min.js"
         if file.is_file():
             return file.read_text(encoding="utf-8")
-    raise MissingDependency('reports need plotly: pip install "lmdsl[report]"')
+    raise MissingDependency(f"reports need plotly: {installed('report')}")

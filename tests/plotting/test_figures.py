@@ -85,7 +85,10 @@ def test_without_matplotlib_the_fix_is_named(solved, monkeypatch):
     for draw in (plotting.portrait, plotting.cost, plotting.figure):
         with pytest.raises(MissingDependency) as caught:
             draw(solved("maze"))
-        assert str(caught.value) == 'plots need matplotlib: pip install "lmdsl[plot]"'
+        assert str(caught.value) == (
+            'plots need matplotlib: pip install "lmdsl[plot]" '
+            '(in a clone: pip install -e ".[plot]")'
+        )
 
 
 def test_pyplot_is_never_imported(tmp_path):

@@ -67,10 +67,23 @@ def test_a_refusal_is_what_is_proved():
 
 def test_proofs_of_the_true_map(result):
     proof = result.prove()
-    assert row(result, "arrives in A", proof)["figure"] == percent(proof.arrives, 6)
+    assert percent(proof.arrives, 6) in row(result, "arrives in A", proof)["figure"]
     assert row(result, "arrives in A", proof)["worth"] == claims.PROVED
     assert row(result, "Share that is undecided", proof)["worth"] == claims.OPEN
     assert row(result, "arrives for certain")["worth"] == claims.UNKNOWN
+
+
+@pytest.mark.parametrize(("lost", "left", "worth", "figure"), [
+    (0.0, 0.8, "not proved", "at least 0 %; 80 % is undecided"),
+    (0.1, 0.8, "proved", "at least 10 %; 80 % is undecided"),
+    (0.0, 0.0, "proved", "0 %"),
+])  # fmt: skip
+def test_what_is_undecided_may_be_lost(result, lost, left, worth, figure):
+    """That no loss is proved while most is undecided is no proof that nothing is lost."""
+    proof = replace(result.prove(), lost=lost, undecided=left, arrives=1 - lost - left, stays=lost)
+    for word in ("that is lost", "stays elsewhere"):
+        assert row(result, word, proof)["worth"] == worth
+        assert row(result, word, proof)["figure"] == figure
 
 
 def test_runs_are_evidence_and_no_proof(result):

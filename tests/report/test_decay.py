@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 import lmdsl as lm
 from lmdsl.machine.deadline import Deadline
-from lmdsl.report.decay import closed_loop_of, decay, spectrum
+from lmdsl.report.decay import LEADING, _leading, closed_loop_of, decay, spectrum
 
 EVER = Deadline()
 
@@ -74,6 +74,18 @@ def test_a_large_part_by_arnoldi():
     assert complete
     assert radius == pytest.approx(0.8, abs=1e-9)
     assert np.abs(found[1]) < 0.1
+
+
+def test_conjugates_stay_together():
+    """A cycle of 31 cells has the 31st roots of its product: 15 pairs, and the list ends in one."""
+    n = 31
+    P = csr_array(0.9 * np.roll(np.eye(n), 1, axis=1))
+    _, found, _ = spectrum(P, EVER)
+    assert LEADING <= len(found) <= LEADING + 1
+    for z in found:
+        assert np.abs(found - z.conj()).min() < 1e-9
+    cut = np.array([0.5, 0.3 + 0.2j, 0.3 - 0.2j, 0.1 + 0.3j])
+    assert np.allclose(_leading(cut), [*cut, 0.1 - 0.3j])
 
 
 def test_what_is_not_finished_is_no_bound():

@@ -9,9 +9,12 @@ import pytest
 from formula_texts import Oracle
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from problems import made, steps
 
+import lmdsl as lm
 from lmdsl.formulas.operations import FORMULA_FUNCTIONS
 from lmdsl.report import mathematics as m
+from lmdsl.report.declared import problem_of
 
 NAMES = {"x": 0.7, "theta": -1.3, "x_1": 2.1, "k12": 0.4, "a_b_c": 1.7, "Omega": -0.2}
 SPOKEN = {letter: name for name, letter in m.GREEK.items()}
@@ -128,3 +131,46 @@ def test_what_is_too_long_or_no_formula_is_text():
     assert m.shown(long, NAMES).startswith("<mtext>x+x")
     assert m.shown("<script>", NAMES) == "<mtext>&lt;script&gt;</mtext>"
     assert m.formula("x +", NAMES) is None
+
+
+def told_of(**more):
+    """What a page declares of a problem, by name: the text and the mathematics of each row."""
+    result = lm.solve(made(steps(**more)))
+    return result, {row["name"]: row for row in problem_of(result)["rows"]}
+
+
+@pytest.mark.parametrize(("attractor", "cells", "which"), [
+    ({"points": [[0.1]]}, "1 cell", "those around the points"),
+    ({"points": [[0.25]]}, "2 cells", "those around the points"),
+    ({"boxes": [{"x": [0, 0.45]}]}, "1 cell", "those wholly inside a box"),
+    ({"where": "x <= 0.6"}, "2 cells", "those on all of which a condition certainly holds"),
+    ({"points": [[0.1]], "boxes": [{"x": [0.25, 0.5]}]}, "2 cells",
+     "those around the points, those wholly inside a box"),
+    ({"cells": [[0]]}, "1 cell", "1 cells by their indices"),
+])  # fmt: skip
+def test_the_cells_of_the_attractor_are_counted_and_named(attractor, cells, which):
+    _, rows = told_of(attractor=attractor)
+    assert rows["attractor A"]["text"].startswith(f"{cells}: {which}")
+
+
+def test_cells_that_hold_are_counted():
+    held = {"kind": "hold"}
+    result, rows = told_of(local_controller=held, attractor={"boxes": [{"x": [0, 0.5]}]})
+    held = result.local_controller.holding
+    assert f"cells, {held} of which hold what arrives" in rows["attractor A"]["text"]
+
+
+def test_cells_that_are_avoided_are_counted():
+    _, rows = told_of(avoid={"boxes": [{"x": [0.8, 0.9]}]})
+    assert rows["avoid Z"]["text"] == "1 cell: all that meet"
+
+
+def test_derivatives_are_fractions():
+    """A dot above a letter runs into it in Chromium."""
+    rate = {"theta": "-0.25*u"}
+    data = steps(system={"kind": "ode", "derivative": rate, "step": 1.0},
+                 state_box={"theta": {"low": 0, "high": 1, "cells": 4}})  # fmt: skip
+    (drawn,) = problem_of(lm.solve(made(data)))["equations"]
+    assert "mover" not in drawn
+    (left,) = list(ET.fromstring(drawn).iter("mfrac"))[:1]
+    assert ["".join(part.itertext()) for part in left] == ["dθ", "dt"]

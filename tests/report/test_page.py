@@ -189,7 +189,9 @@ def test_without_plotly_the_fix_is_named(solved, tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "find_spec", lambda name: None)
     with pytest.raises(MissingDependency) as caught:
         solved("steps").report(tmp_path / "a.html")
-    assert str(caught.value) == 'reports need plotly: pip install "lmdsl[report]"'
+    assert str(caught.value) == (
+        'reports need plotly: pip install "lmdsl[report]" (in a clone: pip install -e ".[report]")'
+    )
     assert not os.listdir(tmp_path)
 
 

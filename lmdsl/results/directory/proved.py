@@ -1,6 +1,7 @@
 """The proof of a result, and what its directory says of it: proof.npz and certificate.json."""
 
 import os
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -169,6 +170,8 @@ def read(path: str | os.PathLike[str], result: Result, said: ProofKeys) -> dict[
 def as_stored(path: str | os.PathLike[str], result: Result, said: ProofKeys | None) -> Proof | None:
     """Return the proof of a directory without its bounds on parts, unchecked; None without one.
 
+    What rests on these bounds is what the certificate says.
+
     BadInput: it cannot be read.
     """
     if said is None:
@@ -177,7 +180,8 @@ def as_stored(path: str | os.PathLike[str], result: Result, said: ProofKeys | No
     wrong = checking.malformed(loop, found)
     if wrong:
         raise BadInput(wrong.removeprefix(f"{NAME}: "), NAME)
-    return Proof.of(found, loop, seconds=said.seconds, holds=said.holds, target=said.target)
+    proof = Proof.of(found, loop, seconds=said.seconds, holds=said.holds, target=said.target)
+    return replace(proof, cost=said.cost, optimum=said.optimum, nonnegative=said.nonnegative)
 
 
 def note(said: ProofKeys) -> str:
