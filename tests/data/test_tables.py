@@ -157,7 +157,7 @@ def test_parquet_without_its_package_names_the_extra(tmp_path, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     (tmp_path / "a.parquet").write_bytes(b"PAR1")
-    with pytest.raises(lm.BadInput, match=r"pip install 'lmdsl\[data\]'"):
+    with pytest.raises(lm.BadInput, match=r'pip install "lmdsl\[data\]"'):
         lm.read_data(tmp_path / "a.parquet")
 
 

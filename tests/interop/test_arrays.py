@@ -127,8 +127,8 @@ def test_a_package_that_is_not_there_is_named(result, monkeypatch):
         (lambda: lm.interop.control_system(result.problem), "control"),
         (lambda: lm.interop.state_space(result.problem, [0.0]), "control"),
     ):
-        with pytest.raises(lm.BadInput, match=rf"pip install 'lmdsl\[{extra}\]'"):
+        with pytest.raises(lm.BadInput, match=rf'pip install "lmdsl\[{extra}\]"'):
             call()
     if result.problem.controls:
-        with pytest.raises(lm.BadInput, match=r"pip install 'lmdsl\[onnx\]'"):
+        with pytest.raises(lm.BadInput, match=r'pip install "lmdsl\[onnx\]"'):
             lm.exports.export_onnx(result, "nowhere.onnx")

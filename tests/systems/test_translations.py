@@ -21,7 +21,7 @@ A, B = Piece("a"), Piece("b")
 @pytest.mark.parametrize("package", ["sympy", "casadi"])
 def test_a_package_that_is_missing_is_named(monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(MissingDependency, match=rf"needs the package {package}; pip install"):
+    with pytest.raises(MissingDependency, match=rf"needs the package {package}: pip install"):
         getattr(lm.systems, f"from_{package}")({"x": 1})
 
 
