@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from lmdsl.advice import declaration, jumps, motion, recorded, sizes
 from lmdsl.advice.report import CheckReport, Finding
 from lmdsl.advice.survey import MOST_SETS, Survey
-from lmdsl.common.types import FilePath, Progress
+from lmdsl.common.types import FilePath, Progress, told
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.assembly.substeps import settled
@@ -19,7 +19,7 @@ def check(
     problem: Problem | FilePath,
     *,
     time_limit: float | Deadline | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> CheckReport:
     """Say what looks wrong with a problem before the long run.
 
@@ -42,6 +42,7 @@ def check(
     TimeLimitReached
         The time limit was reached.
     """
+    progress = told(progress)
     problem = given(problem)
     deadline = Deadline.of(time_limit)
     if progress:

@@ -25,3 +25,8 @@ def never() -> bool:
 
 
 Guard = Callable[[], object]  # asked during long evaluations whether to go on; it raises if not
+
+
+def told(progress: Progress | bool | None) -> Progress | None:
+    """Return whom to tell, once True stands for a line on stderr (see ``own_arithmetic``)."""
+    return progress if callable(progress) else None

@@ -8,7 +8,7 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
-from lmdsl.common.types import Bools, FilePath, Progress, Statuses
+from lmdsl.common.types import Bools, FilePath, Progress, Statuses, told
 from lmdsl.errors import BadInput, shown
 from lmdsl.explanation import finite, one_cell, whole_cell
 from lmdsl.explanation.changes import every_hint
@@ -226,7 +226,7 @@ def explain(
     regions: int = 8,
     phase_one: bool = False,
     time_limit: float | Deadline | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Explanation:
     """Explain which cells cannot be stabilized, why, and what would help.
 
@@ -253,7 +253,7 @@ def explain(
         The phase-one LP is not solved.
     """
     problem = given(problem, StabilizationLP)
-    deadline = Deadline.of(time_limit)
+    progress, deadline = told(progress), Deadline.of(time_limit)
     regions, phase_one = inputs.whole(regions, "regions"), inputs.flag(phase_one, "phase_one")
     assembled = None
     if phase_one:

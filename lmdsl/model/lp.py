@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen, freeze
-from lmdsl.common.types import FilePath, Floats, Indices, Progress, Statuses
+from lmdsl.common.types import FilePath, Floats, Indices, Progress, Statuses, told
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
@@ -255,7 +255,7 @@ class StabilizationLP(Frozen):
 
 @own_arithmetic
 def compile(  # noqa: A001
-    problem: Problem | FilePath, progress: Progress | None = None,
+    problem: Problem | FilePath, progress: Progress | bool | None = None,
     time_limit: float | Deadline | None = None, *, dropped: Any = None,
 ) -> StabilizationLP:  # fmt: skip
     """Compile a problem: transitions, stabilizable set and the LP on it.
@@ -278,6 +278,7 @@ def compile(  # noqa: A001
     BadInput
         A set has no cells, a cost is negative or not finite, or memory does not suffice.
     """
+    progress = told(progress)
     deadline = Deadline.of(time_limit)
     problem = settled(given(problem), deadline)
     partition = Partition.of(problem)

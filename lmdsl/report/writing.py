@@ -12,7 +12,7 @@ import numpy as np
 from lmdsl.common import inputs
 from lmdsl.common.files import write_whole
 from lmdsl.common.optional import installed
-from lmdsl.common.types import Progress
+from lmdsl.common.types import Progress, told
 from lmdsl.errors import BadInput, LmdslError, MissingDependency, plain_text, shown
 from lmdsl.machine import memory
 from lmdsl.machine.surroundings import own_arithmetic
@@ -39,9 +39,10 @@ def write(
     proof: Proof | None = None,
     comparison: Comparison | None = None,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> None:
     """Write one page about a result; see :meth:`Result.report`."""
+    progress = told(progress)
     inputs.kind(result, Result, "result", "a Result")
     if proof is not None:
         inputs.kind(proof, Proof, "proof", "what Result.prove returns")
@@ -63,7 +64,7 @@ def write_directory(
     backends: tuple[str, ...] = (),
     seed: int = 0,
     time_limit: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> tuple[Path, Verification | None]:
     """Write one page about a result directory; return where, and what checking it found.
 
@@ -84,6 +85,7 @@ def write_directory(
     progress
         Called with (stage, fraction done, or -1); True shows it on stderr.
     """
+    progress = told(progress)
     from lmdsl.results.comparison import compare
 
     target = Path(directory) / "report.html" if path is None else inputs.path(path)

@@ -9,7 +9,7 @@ import numpy as np
 
 from lmdsl.common import html, inputs
 from lmdsl.common.records import Reported
-from lmdsl.common.types import FilePath, Progress
+from lmdsl.common.types import FilePath, Progress, told
 from lmdsl.errors import BadInput, printable, shown
 from lmdsl.machine.deadline import TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
@@ -122,7 +122,7 @@ def compare(
     *,
     tolerance: float = TOLERANCE,
     time_limit: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Comparison:
     """Solve the same LP with several backends and compare the verified answers.
 
@@ -142,6 +142,7 @@ def compare(
     BadInput
         As for :func:`lmdsl.solve`; also where no backend is named.
     """
+    progress = told(progress)
     if isinstance(backends, str):
         raise BadInput(f"name the backends in a list: [{shown(backends)}]", "backends")
     inputs.kind(backends, Sequence, "backends", "a list of backends")

@@ -14,7 +14,7 @@ from lmdsl.certificate import sums
 from lmdsl.certificate.claims import Certificate
 from lmdsl.common import inputs
 from lmdsl.common.records import freeze
-from lmdsl.common.types import Bools, Floats, Progress, Statuses
+from lmdsl.common.types import Bools, Floats, Progress, Statuses, told
 from lmdsl.control.questions import InUse
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.forking import cached_property
@@ -207,7 +207,7 @@ class Result(Paged, Carried, Summary, InUse):
     @own_arithmetic
     def prove(
         self, target: float = 0.999, time_limit: float | None = None, *, bracket: bool = False,
-        progress: Progress | None = None,
+        progress: Progress | bool | None = None,
     ) -> Proof:  # fmt: skip
         """Prove what becomes of C under the controller: of the true map, by volume.
 
@@ -229,7 +229,7 @@ class Result(Paged, Carried, Summary, InUse):
         """
         from lmdsl.results.directory.proved import prove
 
-        return prove(self, target, time_limit, progress, bracket)
+        return prove(self, target, time_limit, told(progress), bracket)
 
     @own_arithmetic
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -14,7 +14,7 @@ from lmdsl.backends.asking import ask
 from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Verified, Witness
 from lmdsl.common import inputs
-from lmdsl.common.types import FilePath, Progress
+from lmdsl.common.types import FilePath, Progress, told
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
@@ -44,7 +44,7 @@ def solve(
     restrict_to_gamma: bool = False,
     proved: float | None = None,
     start: Result | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Result:
     """Solve a problem and verify the answer.
 
@@ -88,6 +88,7 @@ def solve(
     BadInput
         The problem or an option cannot be used.
     """
+    progress = told(progress)
     problem = given(problem, StabilizationLP)
     _check_options(tolerance, max_iterations)
     require_all = inputs.flag(require_all, "require_all")

@@ -260,7 +260,7 @@ class Paged:
         proof: Any = None,
         comparison: Any = None,
         seed: int = 0,
-        progress: Progress | None = None,
+        progress: Progress | bool | None = None,
     ) -> None:
         """Write one self-contained page about the result, HTML without network.
 

@@ -16,7 +16,7 @@ from lmdsl.certificate.exact_sums import BLOCK
 from lmdsl.certificate.judge import exact_verdict, verdict
 from lmdsl.common import inputs
 from lmdsl.common.records import Reported, jsonable
-from lmdsl.common.types import Progress
+from lmdsl.common.types import Progress, told
 from lmdsl.errors import BadInput, printable
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
@@ -111,7 +111,7 @@ class Verification(Reported):
 
 @own_arithmetic
 def verify(
-    path: str | os.PathLike[str], *, exact: bool = False, progress: Progress | None = None,
+    path: str | os.PathLike[str], *, exact: bool = False, progress: Progress | bool | None = None,
     time_limit: float | Deadline | None = None,
 ) -> Verification:  # fmt: skip
     """Recompile the problem of a result directory and check every claim it makes.
@@ -134,7 +134,7 @@ def verify(
     BadInput
         The directory cannot be read.
     """
-    deadline = Deadline.of(time_limit)
+    progress, deadline = told(progress), Deadline.of(time_limit)
     in_time = partial(deadline.raise_if_over, "verifying")
     exactly = partial(exact_verdict, guard=in_time)
     judge = exactly if inputs.flag(exact, "exact") else verdict

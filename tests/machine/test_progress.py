@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import logging
 import sys
@@ -236,3 +237,16 @@ def test_times_are_spoken():
     assert [spoken(s) for s in (0.4, 89, 200, 7200, 2e6)] == [
         "0 s", "89 s", "3 min", "2 h", "23 days",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        *(lm.compile, lm.solve, lm.verify, lm.compare, lm.check, lm.explain, lm.gamma_max),
+        *(lm.study, lm.suggest, lm.Result.prove, lm.Result.report),
+    ],
+)
+def test_types_say_that_progress_may_be_true(function):
+    said = str(inspect.signature(function).parameters["progress"].annotation)
+    assert "bool" in said
+    assert "None" in said

@@ -9,7 +9,7 @@ from lmdsl.advice.studies.knobs import Variation, variants
 from lmdsl.advice.studies.orders import orders
 from lmdsl.advice.studies.record import Study, StudyRow
 from lmdsl.common import inputs
-from lmdsl.common.types import FilePath, Progress
+from lmdsl.common.types import FilePath, Progress, told
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
@@ -35,7 +35,7 @@ def study(
     starts: int = 1_000,
     tolerance: float = TOLERANCE,
     time_limit: float | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Study:
     """Solve variants of a problem in turn, and see what they make of cost, coverage and runs.
 
@@ -71,6 +71,7 @@ def study(
         A value makes no sense, or the folder is no study's. A variant that is no problem, as cells
         too large for the attractor, is a row with the status ``bad_input``.
     """
+    progress = told(progress)
     problem = given(problem)
     knobs = {"cells": cells, "samples": samples, "gamma": gamma, "step": step, "backends": backends}
     asked = variants(problem, knobs)

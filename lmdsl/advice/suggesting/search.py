@@ -17,7 +17,7 @@ from lmdsl.advice.suggesting.choices import Combination
 from lmdsl.advice.suggesting.pilots import Attempt, tried
 from lmdsl.advice.suggesting.reasons import reasons
 from lmdsl.advice.suggesting.report import Suggestion, changes
-from lmdsl.common.types import FilePath, Progress
+from lmdsl.common.types import FilePath, Progress, told
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
@@ -75,7 +75,7 @@ def suggest(
     problem: Problem | FilePath,
     *,
     time_limit: float | Deadline | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Suggestion:
     """Suggest step, cells and samples together, from trials, and say why.
 
@@ -98,6 +98,7 @@ def suggest(
     TimeLimitReached
         The time was up before the first trial.
     """
+    progress = told(progress)
     problem = given(problem)
     if isinstance(problem.system, MatrixSystem):
         raise BadInput("a finite model has its states and no samples; nothing is to be chosen",

@@ -27,7 +27,7 @@ import numpy as np
 
 from lmdsl.common import inputs
 from lmdsl.common.records import Frozen
-from lmdsl.common.types import FilePath, Floats, Policy, Progress, TimeUp, never
+from lmdsl.common.types import FilePath, Floats, Policy, Progress, TimeUp, never, told
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, Stopped
 from lmdsl.machine.surroundings import own_arithmetic
@@ -135,7 +135,7 @@ CORNER = (
 @own_arithmetic
 def gamma_max(
     problem: Problem | StabilizationLP | FilePath,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     time_limit: float | Deadline | None = None,
     width: float = WIDTH,
 ) -> GammaBar:
@@ -165,6 +165,7 @@ def gamma_max(
     TimeLimitReached
         It was not compiled in time.
     """
+    progress = told(progress)
     problem = given(problem, StabilizationLP)
     if not inputs.is_number(width) or not LEAST_WIDTH <= width <= 1:
         raise BadInput(f"{shown(width)} must be a number from {LEAST_WIDTH} to 1", "width")
