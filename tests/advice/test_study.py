@@ -312,3 +312,24 @@ def test_keys_tell_variants_apart(tmp_path):
             keeping.Folder(tmp_path, {"starts": 4}).key(a, "highs")}  # fmt: skip
     assert len(keys) == 4
     assert not (tmp_path / "none").exists()
+
+
+def test_where_the_attractor_differs_no_order_is_told():
+    """Cells within the declared box: 2/8, 4/16 and 10/32 of the axis are different problems."""
+    sizes = ((8, 0.25), (16, 0.25), (32, 0.3125))
+    rows = [row(cells={"x": n}, cost=3 + 1 / n, attractor=a) for n, a in sizes]
+    (found,) = orders.orders(rows)
+    assert (found.order, found.limit) == (None, None)
+    assert "the attractor differs (25 %, 25 %, 31.25 % of the cells)" in str(found)
+    assert str(found) in record.Study("x", tuple(rows), (found,)).table()
+    (same,) = orders.orders([row(cells={"x": n}, cost=3 + 1 / n, attractor=0.25) for n, _ in sizes])
+    assert same.order == pytest.approx(1.0, rel=1e-3)
+
+
+def test_the_attractor_of_a_variant_is_told():
+    box = {"boxes": [{"x": [0, 1.1]}]}
+    found = running.study(made({**ODE, "attractor": box}), cells=[8, 16, 32], starts=0)
+    assert [r.attractor for r in found.rows] == [0.25, 0.25, 8 / 32]
+    other = running.study(made({**ODE, "attractor": box}), cells=[10, 20, 40], starts=0)
+    assert [r.attractor for r in other.rows] == [2 / 10, 5 / 20, 11 / 40]
+    assert "attractor differs" in other.table()

@@ -93,9 +93,9 @@ class Folder:
 def _row(data: Any, where: str) -> StudyRow:
     """Return a row that was kept; BadInput where it is none."""
     names, kinds = [f.name for f in fields(StudyRow)], get_type_hints(StudyRow)
-    if not isinstance(data, dict) or set(data) != set(names):
+    if not isinstance(data, dict) or {*data, "attractor"} != set(names):
         raise BadInput("its keys are not those of a row; remove the folder to start anew", where)
-    found = dict(data)
+    found = {"attractor": None, **data}  # which came later
     if isinstance(found["interval"], list):
         found["interval"] = tuple(found["interval"])
     for name in names:

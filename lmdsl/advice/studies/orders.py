@@ -14,6 +14,7 @@ from lmdsl.common.records import Reported
 
 QUANTITIES = ("cost", "coverage")  # the share that arrives is known too roughly
 LEAST, MOST = 1e-3, 20.0  # orders that are told
+SAME = 1e-9  # relative difference of volumes that is rounding
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,8 @@ class Order(Reported):
         p of q + c h^p through them; None where they do not settle like that.
     limit
         q; None where p is.
+    why
+        Why no order is told, where more variants of this kind would not help.
     """
 
     knob: str
@@ -44,12 +47,14 @@ class Order(Reported):
     values: tuple[float, float, float]
     order: float | None
     limit: float | None
+    why: str = ""
 
     def __str__(self) -> str:
         held = ", ".join(f"{name} {_plain(value)}" for name, value in self.held.items())
         place = f" ({held})" * bool(held)
         if self.order is None or self.limit is None:
-            return f"{self.quantity} over {self.knob}{place}: no order can be told yet"
+            why = self.why or "no order can be told yet"
+            return f"{self.quantity} over {self.knob}{place}: {why}"
         return (
             f"{self.quantity} over {self.knob}{place}: order {self.order:.2g}, "
             f"limit about {self.limit:.6g}"
@@ -109,11 +114,25 @@ def _order(
     if len(h) < 3:
         return None
     q = tuple(known[each] for each in h)
-    p = observed(*h, *q)
+    why = _differ(rows, [*h], knob)
+    p = None if why else observed(*h, *q)
     limit = None if p is None else q[2] + (q[2] - q[1]) * h[2] ** p / (h[1] ** p - h[2] ** p)
     if limit is not None and (limit < 0 or (quantity == "coverage" and limit > 1)):
         p, limit = None, None  # they have not begun to settle
-    return Order(knob, quantity, held, (h[0], h[1], h[2]), (q[0], q[1], q[2]), p, limit)
+    return Order(knob, quantity, held, (h[0], h[1], h[2]), (q[0], q[1], q[2]), p, limit, why)
+
+
+def _differ(rows: Sequence[StudyRow], h: Sequence[float], knob: str) -> str:
+    """Return that variants are of different problems, if they are: their attractors differ."""
+    of = {width(row, knob): row.attractor for row in rows}
+    sizes = [size for each in h if (size := of[each]) is not None]
+    if not sizes or max(sizes) - min(sizes) <= SAME * max(sizes):
+        return ""
+    told = ", ".join(f"{100 * size:.4g} %" for size in sizes)
+    return (
+        f"no order, the attractor differs ({told} of the cells): choose numbers of cells whose "
+        "faces are those of the declared set"
+    )
 
 
 def observed(h1: float, h2: float, h3: float, q1: float, q2: float, q3: float) -> float | None:

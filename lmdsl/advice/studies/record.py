@@ -29,6 +29,8 @@ class StudyRow(Reported):
         As of a result.
     coverage
         Share of the cells outside attractor and avoid that are stabilizable.
+    attractor
+        Share of the cells that are the attractor: of the declared one, whole cells.
     pairs
         Number of surviving pairs.
     arrives, interval
@@ -54,6 +56,7 @@ class StudyRow(Reported):
     lower_bound: float | None = None
     gap: float | None = None
     coverage: float | None = None
+    attractor: float | None = None
     pairs: int | None = None
     arrives: float | None = None
     interval: tuple[float, float] | None = None
@@ -83,6 +86,7 @@ COLUMNS = (
     ("cost", lambda row: row.cost, ".6g"),
     ("gap", lambda row: row.gap, ".1e"),
     ("coverage", lambda row: row.coverage, ".1%"),
+    ("attractor", lambda row: row.attractor, ".3%"),
     ("arrives", lambda row: row.arrives, ".1%"),
     ("steps", lambda row: row.steps, ""),
     ("compile", lambda row: row.compile_seconds, ".2f"),
@@ -138,7 +142,8 @@ class Study(Reported):
             for line, row in zip(self._cells()[1], self.rows, strict=True)
             if row.status != "verified" and row.message
         ]
-        return notes + [str(order) for order in self.orders if order.order is not None]
+        told = [order for order in self.orders if order.order is not None or order.why]
+        return notes + [str(order) for order in told]
 
     def records(self) -> list[dict[str, Any]]:
         """Return a flat dictionary for each row: the cells of each axis under ``cells.NAME``."""

@@ -179,6 +179,7 @@ class _Work:
             lower_bound=result.lower_bound,
             gap=result.gap,
             coverage=None if covered is None else covered.share,
+            attractor=_share(result.attractor_cells, result.cells),
             pairs=result.pairs,
             arrives=runs.reached / runs.starts if runs is not None and aimed else None,
             interval=runs.interval if runs is not None and aimed else None,
@@ -190,3 +191,7 @@ class _Work:
             verify_seconds=seconds.verify,
             message=result.message,
         )
+
+
+def _share(some: int | None, cells: int | None) -> float | None:
+    return some / cells if some is not None and cells else None
