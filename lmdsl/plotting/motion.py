@@ -67,13 +67,16 @@ def portrait(
             inputs.whole(count, name)
     partition = Partition.of(given)
     sets = CellSets.of(given, partition)
-    view = View.of(partition, sets.attractor, axes, at)
+    attractor = sets.attractor
+    if isinstance(problem, Result):  # of which only what holds may be left
+        attractor = problem.cell_status == CellStatus.ATTRACTOR
+    view = View.of(partition, attractor, axes, at)
     u = runs.control_vector(given, control)
     lines = runs.is_ode(given)
     held = ", ".join(f"{plain(k, 16)} = {number(v)}" for k, v in u.items())
     title = ("flow" if lines else "map") + (f" at {held}" if held else "") + view.note
     drawn: Axes = layers.frame(ax, view, title)
-    regions.obstacles(drawn, view, sets.attractor, sets.avoid, legend=False)
+    regions.obstacles(drawn, view, attractor, sets.avoid, legend=False)
     if len(view.axes) == 1:
         if not view.whole:
             raise BadInput("a phase portrait needs two axes", "axes")
@@ -88,7 +91,7 @@ def portrait(
     first, place = runs.tiled(partition, view, starts or (8 if lines else 14))
     points = runs.open_loop(given, partition, first, u, steps or (60 if lines else 300), fine=lines)
     overlays.orbits(drawn, view, points, place[:, 1], lines)
-    regions.outline(drawn, view, view.shadow(sets.attractor), regions.ATTRACTOR, 1.6)
+    regions.outline(drawn, view, view.shadow(attractor), regions.ATTRACTOR, 1.6)
     return drawn
 
 

@@ -9,7 +9,8 @@ from problems import made, standard_map
 
 import lmdsl as lm
 from lmdsl import plotting
-from lmdsl.plotting import runs
+from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.plotting import regions, runs
 from lmdsl.plotting.view import View, segments
 
 pytest.importorskip("matplotlib")
@@ -117,3 +118,27 @@ def test_runs_of_one_dimension_go_over_the_step(solved):
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("step", "x")
     dots = np.asarray(next(c for c in ax.collections if c.get_zorder() == 2.2).get_offsets())
     assert np.array_equal(dots, np.stack([np.arange(len(path)), path], axis=-1))
+
+
+def test_portrait_of_a_result_shows_what_is_left_of_the_attractor(monkeypatch):
+    axis = {"low": -1, "high": 1, "cells": 20}
+    held = {
+        "system": {"kind": "map", "next": {"x": "1.5 * x + u", "y": "0.5 * y"}},
+        "state_box": {"x": axis, "y": axis},
+        "attractor": {"boxes": [{"x": [-0.6, 0.6], "y": [-0.3, 0.3]}]},
+        "control_grid": {"u": {"low": -0.2, "high": 0.2, "points": 9}},
+        "stage_cost": "1",
+        "local_controller": {"kind": "hold"},
+        "sampling": {"kind": "grid", "per_axis": 3},
+        "format": "lmdsl/1",
+    }
+    result = lm.solve(made(held))
+    left = np.flatnonzero(result.cell_status == CellStatus.ATTRACTOR)
+    seen = []
+    outline = regions.outline
+    monkeypatch.setattr(regions, "outline", lambda ax, view, mask, *more: (
+        seen.append(np.flatnonzero(mask)), outline(ax, view, mask, *more)))  # fmt: skip
+    plotting.portrait(result)
+    plotting.portrait(result.problem)
+    assert 0 < len(left) < len(seen[1])
+    np.testing.assert_array_equal(seen[0], left)
