@@ -2,6 +2,7 @@
 // Follows the map that a page holds, under the table of controls: no pictures here, no document.
 
 const EDGE = 1e-9, MOST_TURNS = 2 ** 20, MOST_PARTS = 1000;
+const FLAT = 0.001, MOST_DRAWN = 32;  // of an axis: how far lines may be from an arc; its lines
 const PATIENCE = 600;  // milliseconds for a run, or for the samples of a cell
 const ATTRACTOR = 0, STABILIZED = 1, AVOID = 5;
 
@@ -26,6 +27,15 @@ async function unpacked(held) {
   const kinds = { u1: Uint8Array, u2: Uint16Array, i4: Int32Array, f4: Float32Array,
     f8: Float64Array };
   return new kinds[held.kind](buffer);
+}
+
+// The point at t of the cubic Hermite arc from a to b, whose slopes there are m and n.
+function hermite(a, b, m, n, t) {
+  const r = 1 - t;
+  return a.map((v, k) => {
+    const rise = b[k] - v;
+    return r * v + t * b[k] + t * r * (r * (m[k] - rise) - t * (n[k] - rise));
+  });
 }
 
 // A source of random numbers that a seed repeats (mulberry32).
@@ -160,22 +170,22 @@ class Follower {
     });
   }
 
-  // One step: { x, cell, cost, way }, `way` the states drawn until then.
-  step(x, u, w) {
+  // One step: { x, cell, cost, way, when }, the states drawn until then, and at what part of it.
+  step(x, u, w, drawn = false) {
     const values = this.named(x, u, w);
     const cost = this.stage ? this.stage(values)[0] : 0;
     if (this.map.kind === "map") {
       const state = this.cells.state(this.program(values), this.cells.clip);
-      return { x: state, cell: this.cells.cell(state), cost, way: [state] };
+      return { x: state, cell: this.cells.cell(state), cost, way: [state], when: [1] };
     }
-    const moved = this.integrated(x, values);
+    const moved = this.integrated(x, values, drawn);
     if (this.map.integrals) moved.cost = moved.integral;
     else moved.cost = cost;
     return moved;
   }
 
   // A sampling time of an equation: classical Runge-Kutta steps, and the first event on their way.
-  integrated(x, values) {
+  integrated(x, values, drawn) {
     const { h, substeps, integrals, path, absorb } = this.map, d = x.length;
     const held = Object.assign(Object.create(null), values);
     const slope = (at) => {
@@ -193,11 +203,33 @@ class Follower {
       states.push(at);
       slopes.push(k1.map((v) => h * v));
     }
-    const met = path ? this.met(states, slopes, absorb) : null, until = met ? met.arc : substeps;
-    const way = states.slice(1, until + 1).map((s) =>
-      this.cells.state(s.slice(0, d), this.cells.clip));
-    if (met) return { x: met.x, cell: met.cell, way: [...way, met.x], integral: met.full[d] };
-    return { x: way[substeps - 1], cell: this.cells.cell(way[substeps - 1]), way, integral: at[d] };
+    const met = path ? this.met(states, slopes, absorb) : null;
+    const end = met ? met.x : this.cells.state(at.slice(0, d), this.cells.clip);
+    const before = drawn ? this.arcs(states, slopes, met) : { way: [], when: [] };
+    const when = [...before.when, met ? (met.arc + met.t) / substeps : 1];
+    return { x: end, cell: met ? met.cell : this.cells.cell(end), way: [...before.way, end], when,
+      integral: (met ? met.full : at)[d] };
+  }
+
+  // What is drawn of a step before its end: points on its arcs, the more the more they bend.
+  arcs(states, slopes, met) {
+    const { axes, clip } = this.cells, count = states.length - 1, way = [], when = [];
+    for (let arc = 0; arc < count && (!met || arc <= met.arc); arc++) {
+      const of = [states[arc], states[arc + 1], slopes[arc], slopes[arc + 1]];
+      const bends = axes.map(({ low, high }, k) => {
+        const rise = of[1][k] - of[0][k];
+        return Math.max(Math.abs(of[2][k] - rise), Math.abs(of[3][k] - rise)) / (high - low);
+      });
+      const until = met && arc === met.arc ? met.t : 1;
+      const lines = until * Math.sqrt((0.75 * Math.max(...bends)) / FLAT);
+      const n = Math.max(1, Math.min(MOST_DRAWN, Math.ceil(lines) || 1));
+      for (let j = 1; j <= n; j++) {
+        const t = (until * j) / n, full = t === 1 ? of[1] : hermite(...of, t);
+        way.push(this.cells.state(full.slice(0, axes.length), clip));
+        when.push((arc + t) / count);
+      }
+    }
+    return { way: way.slice(0, -1), when: when.slice(0, -1) };
   }
 
   // The first event on the cubic Hermite arcs between knots, looked for at equal parts; or null.
@@ -213,16 +245,13 @@ class Follower {
     for (let arc = 0; arc + 1 < states.length; arc++) {
       const [a, b, m, n] = [states[arc], states[arc + 1], slopes[arc], slopes[arc + 1]];
       for (let j = 1; j <= parts; j++) {
-        const t = j / parts, r = 1 - t;
+        const t = j / parts;
         if (j === parts && arc + 2 === states.length) return null;  // the image itself
-        const full = j === parts ? b : a.map((v, k) => {
-          const rise = b[k] - v;
-          return r * v + t * b[k] + t * r * (r * (m[k] - rise) - t * (n[k] - rise));
-        });
+        const full = j === parts ? b : hermite(a, b, m, n, t);
         const x = this.cells.state(full.slice(0, d), false), cell = this.cells.cell(x);
-        if (cell < 0 && !this.cells.clip) return { x, cell, full, arc };
+        if (cell < 0 && !this.cells.clip) return { x, cell, full, arc, t };
         const status = cell < 0 ? STABILIZED : this.arrays.status[cell];
-        if (status === AVOID || (status === ATTRACTOR && absorb)) return { x, cell, full, arc };
+        if (status === AVOID || (status === ATTRACTOR && absorb)) return { x, cell, full, arc, t };
       }
     }
     return null;
@@ -244,28 +273,31 @@ class Follower {
     return status === STABILIZED ? null : "entered a cell without a control law";
   }
 
-  // A closed-loop run: states by step, all that is drawn, controls, cost and what became of it.
+  // A closed-loop run: states by step, all that is drawn and when, controls, cost, and its outcome.
   run(start, steps, seed) {
     const random = dice(seed), weight = this.map
       ? this.map.gamma * (this.map.discount || 1) : 1;
     let x = this.cells.state(start, this.cells.clip), cell = this.cells.cell(x);
-    const run = { states: [x], drawn: [x], controls: [], cost: 0, outcome: this.ending(cell) };
+    const run = { states: [x], drawn: [x], times: [0], controls: [], cost: 0,
+      outcome: this.ending(cell) };
     const until = Date.now() + PATIENCE;
     let power = 1;
     while (run.outcome === null && run.controls.length < steps && Date.now() < until) {
       const u = this.control(cell);
       if (u === null) { run.outcome = "entered a cell without a control law"; break; }
-      run.controls.push(u);
+      const n = run.controls.push(u);
       if (this.map) {
-        const moved = this.step(x, u, this.draw(random));
+        const moved = this.step(x, u, this.draw(random), true);
         ({ x, cell } = moved);
         run.cost += power * moved.cost;
         run.drawn.push(...moved.way);
+        run.times.push(...moved.when.map((part) => n - 1 + part));
       } else {
         run.cost += this.arrays.rows.cost[this.arrays.rows.position[cell]];
         cell = this.drawn(cell, random);
         if (cell >= 0) x = this.cells.centre(cell);
         run.drawn.push(x);
+        run.times.push(n);
       }
       power *= weight;
       run.states.push(x);

@@ -91,7 +91,7 @@ class Page {
     this.mark();
     const last = this.runs[this.runs.length - 1];
     document.getElementById("time").style.display = last ? "" : "none";
-    if (last) await drawTime(last, this.follower.names, this.follower.controls);
+    if (last) await drawTime(last, this.follower.names, this.follower.controls, this.cells.axes);
   }
 
   mark(dot) {
@@ -309,10 +309,13 @@ class Page {
     const run = this.runs[this.runs.length - 1], [a, b] = this.view.axes;
     clearInterval(this.playing);
     if (!run) return;
-    const pause = Math.max(16, Math.min(250, 6000 / run.drawn.length));
-    let n = 0;
+    const total = run.times.at(-1);
+    const frames = this.smooth ? Math.ceil(Math.min(12 * total, 400)) : total;
+    const pause = Math.max(16, Math.min(250, 6000 / (frames + 1)));
+    let n = 0, i = 0;
     this.playing = setInterval(() => {
-      const x = run.drawn[n++];
+      while (i + 1 < run.times.length && run.times[i + 1] * frames <= total * n + 1e-9) i++;
+      const x = n++ <= frames ? run.drawn[i] : null;
       if (!x) clearInterval(this.playing);
       this.mark(x && ["dot", x[a], b === undefined ? 0.5 : x[b], 7]);
     }, pause);

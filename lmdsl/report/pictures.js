@@ -135,30 +135,22 @@ function valueTraces(slice, layer, values) {
     colorscale: PALETTES[layer.key] || "Cividis" }];
 }
 
-// Lines between successive states, broken where a periodic axis wraps.
-function lineOf(states, axes, cells) {
-  const found = axes.map(() => []);
-  states.forEach((x, n) => {
-    const before = states[n - 1];
-    const torn = before && axes.some((k) => cells.axes[k].periodic
-      && Math.abs(x[k] - before[k]) > (cells.axes[k].high - cells.axes[k].low) / 2);
-    if (torn) found.forEach((line) => line.push(null));
-    axes.forEach((k, i) => found[i].push(x[k]));
-  });
-  return found;
-}
-
 function runTraces(slice, runs, smooth) {
   if (slice.flat) return [];
   const t = theme(), found = [];
   for (const run of runs) {
-    const [x, y] = lineOf(run.drawn, slice.view.axes, slice.cells);
+    const { axes } = slice.view, of = (x) => axes.map((k) => x[k]);
+    const [x, y] = lineOf(run.drawn.map(of), axes.map((k) => slice.cells.axes[k]));
     const good = run.outcome === "reached A";
     const same = { type: "scatter", x, y, hoverinfo: "skip" };
     found.push({ ...same, mode: "lines", line: { color: t.paper, width: smooth ? 4.5 : 3 } });
-    found.push({ ...same, mode: smooth ? "lines" : "lines+markers", marker: { size: 5,
-      color: t.ink, line: { color: t.paper, width: 1 } },
-    line: { color: t.ink, width: smooth ? 2 : 0.9, dash: good || !run.outcome ? "solid" : "dot" } });
+    found.push({ ...same, mode: "lines", line: { color: t.ink, width: smooth ? 2 : 0.9,
+      dash: good || !run.outcome ? "solid" : "dot" } });
+    if (!smooth) {
+      const at = run.states.map(of);
+      found.push({ ...same, x: at.map((s) => s[0]), y: at.map((s) => s[1]), mode: "markers",
+        marker: { size: 5, color: t.ink, line: { color: t.paper, width: 1 } } });
+    }
     const ends = [run.states[0], run.states[run.states.length - 1]];
     found.push({ type: "scatter", mode: "markers", hoverinfo: "skip",
       x: ends.map((s) => s[slice.view.axes[0]]), y: ends.map((s) => s[slice.view.axes[1]]),

@@ -132,6 +132,28 @@ def test_the_other_axes_are_put_together(pages, solved):
         assert np.allclose(found[some], wanted, rtol=1e-5)
 
 
+def test_lines_over_time_go_over_the_seam_from_edge_to_edge(pages):
+    """Of runs on a torus, until one is met that goes over the seam: no spike is left."""
+    lines = asked(
+        pages("standard"),
+        """const button = [...document.querySelectorAll("#controls button")][0];
+        for (let n = 0; n < 30; n++) {
+          button.click();
+          await wait(100);
+          const lines = document.getElementById("time").data.filter((t) =>
+            t.mode === "lines" && t.yaxis !== "y2").map((t) => Array.from(t.y));
+          if (lines.some((y) => y.includes(null))) return lines;
+        }""",
+    )
+    assert any(None in y for y in lines)
+    for y in lines:
+        for a, b, c in zip(y, y[1:], y[2:], strict=False):
+            if b is None:
+                assert sorted((a, c)) == [0, 1]
+            elif a is not None:
+                assert abs(a - b) <= 0.5
+
+
 def test_names_do_nothing_in_a_browser(tmp_path):
     problem = made(steps()).replaced(name=EVIL)
     lm.solve(problem).report(tmp_path / "a.html")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from formula_texts import UFUNCS
 from problems import made, standard_map, steps
-from reports import followed, node, told
+from reports import SCRIPTS, followed, node, told
 
 import lmdsl as lm
 from lmdsl.formulas.language import parse, parse_condition
@@ -175,3 +175,70 @@ def test_conditions_are_values_too():
     """A condition of the language is 1 where it holds: the page treats it likewise."""
     program = Program([parse_condition("x < 1 and not x < 0", "x")])
     assert program_of(program)["code"][-1][0] == "and"
+
+
+# What is drawn of runs -----------------------------------------------------------------------
+
+
+@node
+def test_runs_of_equations_are_drawn_along_their_arcs():
+    """x' = y, y' = -x, three Runge-Kutta steps a sampling time: on a circle, not on a polygon."""
+    box = {"low": -2, "high": 2, "cells": 16}
+    data = steps(system={"kind": "ode", "derivative": {"x": "y", "y": "-x + 0*u"}, "step": 1.2,
+                         "substeps": 3, "judged": "endpoint"},
+                 state_box={"x": box, "y": box}, attractor={"points": [[0.05, 0.05]]},
+                 control_grid={"u": {"values": [0]}})  # fmt: skip
+    code = """F.control = () => [0];
+    F.ending = () => null;
+    return F.run([1, 0], 4, 1);"""
+    run = followed(told(lm.solve(made(data))), code)
+    times, drawn = np.array(run["times"]), np.array(run["drawn"])
+    assert len(times) == len(drawn) > 4 * 3 * 2
+    assert (np.diff(times) > 0).all()
+    angle = 1.2 * times
+    assert np.allclose(drawn, np.stack([np.cos(angle), -np.sin(angle)], axis=-1), atol=3e-3)
+    middle = (drawn[1:] + drawn[:-1]) / 2
+    assert np.abs(np.hypot(*middle.T) - 1).max() < 5e-3
+    at = np.searchsorted(times, np.arange(5) - 1e-9)
+    assert np.allclose(drawn[at], run["states"], atol=0)
+
+
+@node
+def test_what_is_drawn_ends_where_a_run_is_stopped_on_its_way(solved):
+    for run in followed(told(solved("lorenz")), RUN):
+        assert len(run["times"]) == len(run["drawn"])
+        assert run["drawn"][-1] == run["states"][-1]
+        n = len(run["controls"])
+        assert max(n - 1, 0) <= run["times"][-1] <= n
+
+
+def lines(points, axes):
+    """The lines between points, as pieces."""
+    code = f"""const {{ lineOf }} = require({json.dumps(str(SCRIPTS / "curves.js"))});
+    return lineOf({json.dumps(points)}, {json.dumps(axes)});"""
+    x, y = followed({}, code)
+    pieces = [[]]
+    for point in zip(x, y, strict=True):
+        if point == (None, None):
+            pieces.append([])
+        else:
+            pieces[-1].append([pytest.approx(v, abs=1e-12) for v in point])
+    return pieces
+
+
+CIRCLE = {"low": -3, "high": 3, "periodic": True}
+FREE = {"low": -3, "high": 3, "periodic": False}
+
+
+@node
+def test_lines_are_broken_at_the_seam():
+    """They go to one edge and begin at the other: of a run over time, and in the plane."""
+    assert lines([[0, 2.5], [1, -2.5]], [None, CIRCLE]) == [
+        [[0, 2.5], [0.5, 3]], [[0.5, -3], [1, -2.5]]]  # fmt: skip
+    assert lines([[-2.5, 0], [2.75, 1]], [CIRCLE, FREE]) == [
+        [[-2.5, 0], [-3, 2 / 3]], [[3, 2 / 3], [2.75, 1]]]  # fmt: skip
+    assert lines([[2.75, 2.5], [-2.5, -2.5]], [CIRCLE, CIRCLE]) == [
+        [[2.75, 2.5], [3, 2.5 + 1 / 3]], [[-3, 2.5 + 1 / 3], [-2.875, 3]],
+        [[-2.875, -3], [-2.5, -2.5]]]  # fmt: skip
+    assert lines([[-3, 0], [3, 1]], [CIRCLE, FREE]) == [[[-3, 0], [-3, 0]], [[3, 0], [3, 1]]]
+    assert lines([[-2.5, 0], [2.5, 1]], [FREE, FREE]) == [[[-2.5, 0], [2.5, 1]]]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from command_line import run
 from problems import made, standard_map, steps
-from reports import LIBRARY, Read, told, written
+from reports import LIBRARY, SCRIPTS, Read, told, written
 
 import lmdsl as lm
 from lmdsl.errors import MissingDependency
@@ -79,6 +79,16 @@ def test_lost_cells_are_told_by_cause_and_region(solved):
         inside = sum(region["cells"] for region in told_[name]["regions"])
         assert inside + told_[name]["elsewhere"] == count
     assert all(region["why"] for region in told_["escapes"]["regions"])
+
+
+def test_what_scrolls_sideways_does_not_scroll_up():
+    """A formula a bit higher than its box would bring a bar; long lines of text are wrapped."""
+    rules = re.findall(r"([^{}]+){([^{}]*)}", (SCRIPTS / "page.css").read_text())
+    sideways = [body for _, body in rules if "overflow-x: auto" in body]
+    assert len(sideways) == 2
+    assert all("overflow-y: hidden" in body for body in sideways)
+    pre = [body for head, body in rules if head.strip() == "pre"]
+    assert "white-space: pre-wrap" in pre[0]
 
 
 # Nothing gets in -----------------------------------------------------------------------------
