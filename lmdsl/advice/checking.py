@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from lmdsl.advice import declaration, jumps, motion, recorded, sizes
+from lmdsl.advice import declaration, jumps, motion, recorded, sizes, targets
 from lmdsl.advice.report import CheckReport, Finding
 from lmdsl.advice.survey import MOST_SETS, Survey
 from lmdsl.common.types import FilePath, Progress, told
@@ -49,6 +49,7 @@ def check(
         progress("check", -1.0)
     own = {name: axis.cells for name, axis in problem.state_box.items()}
     findings: list[Finding] = []
+    notes: list[Finding] = []
     if isinstance(problem.system, MatrixSystem):
         level, found = sizes.of_matrices(problem, deadline)
         known = [level]
@@ -63,13 +64,16 @@ def check(
         share = found.coverage if found.coverage_cells == own else None
         findings += _of_the_map(survey, share, deadline)
         findings += sizes.shrinking(problem, known, deadline)
-    findings += [*sizes.nothing(known, own), *sizes.too_large(found)]
-    return CheckReport(tuple(findings), found, own)
+        notes += targets.shrunk(problem, partition)
+    findings += [*targets.little(problem, known, deadline), *sizes.too_large(found)]
+    return CheckReport(tuple(findings), found, own, tuple(notes))
 
 
 def _of_the_map(survey: Survey, share: float | None, deadline: Deadline) -> Iterator[Finding]:
     """Yield what is found about a map; the share that can be stabilized is None if unknown."""
     yield from declaration.unused(survey.problem)
+    yield from declaration.idle(survey.problem)
+    yield from targets.chance(survey)
     yield from declaration.angles(survey, share, deadline)
     yield from declaration.degrees(survey)
     yield from motion.few_substeps(survey, deadline)

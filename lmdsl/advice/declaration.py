@@ -10,6 +10,7 @@ from lmdsl.explanation import remedies
 from lmdsl.explanation.trials import MapTrial
 from lmdsl.machine.deadline import Deadline
 from lmdsl.problem.problem import Problem
+from lmdsl.systems import MatrixSystem
 from lmdsl.systems.named import NamedSystem
 
 NAME = re.compile(r"[A-Za-z_]\w*")
@@ -45,6 +46,66 @@ def unused(problem: Problem) -> Iterator[Finding]:
                     "remove it, or correct the formula in which it was meant",
                     {"name": name},
                 )
+
+
+def idle(problem: Problem) -> Iterator[Finding]:
+    """Find controls that stand in formulas, of the cost say, and change no next state."""
+    steps = _steps(problem)
+    if not steps:
+        return
+    data, acting = problem.to_dict(), set[str]().union(*steps.values())
+    kept = {key: data[key] for key in data if key not in ("format", "name", "system", "let")}
+    let = data.get("let") or {}
+    found = {}
+    for name in problem.controls:
+        keys = [key for key, part in kept.items() if name in _used(_texts(part), let)]
+        if name not in acting and keys:
+            found[name] = keys
+    every = len(found) == len(problem.controls)
+    for name, keys in found.items():
+        whole = "no control changes any next state: " if every else ""
+        yield Finding(
+            "idle_control",
+            f"control_grid.{name}",
+            f"{whole}{name} {'stands' if every else 'changes no next state: it stands'} only in "
+            f"{' and '.join(keys)}",
+            f"write {name} into the formulas of system where it acts, or remove it",
+            {"name": name, "stands_in": keys},
+        )
+
+
+def unsteered(problem: Problem) -> list[str]:
+    """Return the states on which no control acts, not even through other states."""
+    steps = _steps(problem)
+    acting, before = set(problem.controls), set[str]()
+    while acting != before:
+        before = set(acting)
+        acting |= {name for name, used in steps.items() if used & acting}
+    return [name for name in steps if name not in acting]
+
+
+def _steps(problem: Problem) -> dict[str, set[str]]:
+    """Return the names that the formulas of each state use; empty where these are not known."""
+    system: Any = problem.system
+    formulas = None
+    if isinstance(system, NamedSystem):
+        formulas = system.formulas
+    elif not problem.functions and not isinstance(system, MatrixSystem):
+        data = problem.to_dict()["system"]
+        formulas = data.get("derivative") or data.get("next")
+    if not isinstance(formulas, Mapping) or set(formulas) != set(problem.states):
+        return {}
+    let = problem.to_dict().get("let") or {}
+    return {name: _used(_texts([text]), let) for name, text in formulas.items()}
+
+
+def _used(texts: list[str], let: Mapping[str, Any]) -> set[str]:
+    """Return the names in formulas, also through subexpressions."""
+    found, new = set[str](), set(NAME.findall(" ".join(texts)))
+    while new:
+        found |= new
+        new = set(NAME.findall(" ".join(_texts([let[x] for x in new if x in let])))) - found
+    return found
 
 
 def _texts(data: Any) -> list[str]:

@@ -47,10 +47,14 @@ def short_step(survey: Survey, share: float | None, deadline: Deadline) -> Itera
         parts += _much_longer(survey, moved, figures)
     if not parts:
         return  # the map itself stays, or a longer step helps nothing
+    far = f"moves {moved:.2g} widths of a cell"
     text = (
-        f"in {count} of {tried} cells tried no control moves any sample out of its cell"
-        f"{', so they are trapped' if count else ''}; under the control that moves it most the "
-        f"median sample {'of these ' if many else ''}moves {moved:.2g} widths of a cell"
+        f"in {count} of {tried} cells tried no control moves any sample out of its cell, so they "
+        f"are trapped; under the control that moves it most the median sample of these {far}"
+        if many
+        else f"under the control that moves it most the median sample {far}, and from "
+        f"{100 * (share or 0.0):.3g} % of the cells can the attractor be reached without loss; "
+        "over a longer step controls tell more apart"
     )
     where = "system.step" if "step" in figures else "system"
     yield Finding("short_step", where, text, "; or ".join(parts), figures)

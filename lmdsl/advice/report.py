@@ -126,7 +126,7 @@ def _seconds(seconds: float) -> str:
     return f"{seconds / 60:.0f} minutes" if seconds < 7200 else f"{seconds / 3600:.3g} hours"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CheckReport(Reported):
     """What looks wrong with a problem before the long run.
 
@@ -138,11 +138,14 @@ class CheckReport(Reported):
         What compiling takes and gives, as far as a survey shows.
     axes
         The cells of each axis.
+    notes
+        What is not wrong and may not be what was meant.
     """
 
     findings: tuple[Finding, ...]
     expected: Expectation
     axes: dict[str, int]
+    notes: tuple[Finding, ...] = ()
 
     def __bool__(self) -> bool:
         """Return whether something was found."""
@@ -151,6 +154,7 @@ class CheckReport(Reported):
     def text(self) -> str:
         """Return the report for people."""
         found = [str(finding) for finding in self.findings] or ["nothing looks wrong"]
+        found += [f"note: {note}" for note in self.notes]
         return "\n\n".join(["\n".join(self.expected.lines(self.axes)), *found])
 
-    __str__ = text
+    __str__ = __repr__ = text

@@ -160,10 +160,10 @@ def of_matrices(problem: Problem, deadline: Deadline) -> tuple[Level, Expectatio
     cells = {name: axis.cells for name, axis in problem.state_box.items()}
     start = time.perf_counter()
     transitions = assemble(problem, Partition.of(problem), deadline=deadline)
-    inside = stabilizable_set.of_problem(problem, transitions, deadline).inside
-    covered = remedies.StabilizableShare(int(inside.sum()), len(inside))
+    found = stabilizable_set.of_problem(problem, transitions, deadline)
+    covered = remedies.counted(transitions, found)
     level = Level(problem, cells, covered, time.perf_counter() - start)
-    pairs = len(inside) * discretization.control_count(problem)
+    pairs = len(found.inside) * discretization.control_count(problem)
     return level, Expectation(
         cells=math.prod(cells.values()),
         controls=discretization.control_count(problem),
@@ -280,17 +280,3 @@ def _box(source: Problem, on: Problem, deadline: Deadline) -> list[Ends]:
             break
     best = max(share for _, share in found)
     return next(fixed for fixed, share in found if share >= best - remedies.ABOUT)
-
-
-def nothing(known: list[Level], own: dict[str, int]) -> Iterator[Finding]:
-    """Find that no cell can be stabilized on the problem's own grid."""
-    for level in known:
-        if level.cells == own and level.found.free and not level.found.stabilizable:
-            yield Finding(
-                "nothing_stabilizable",
-                "state_box",
-                f"none of the {level.found.free} cells outside attractor and avoid can be "
-                "stabilized",
-                "`lmdsl explain FILE` says why, region by region, and what would help",
-                {"cells": level.found.free},
-            )

@@ -30,6 +30,7 @@ OPTIONS = (
 )
 # Runs of the true map that follow a solve: how many, how long, and how long all together.
 STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
+LITTLE = 0.1  # share of cells that can be stabilized below which that is said first
 
 
 def add(command: Command) -> None:
@@ -189,7 +190,14 @@ def _summary(result: Any) -> str:
     rows.append(("seconds", ", ".join(spent) or "-"))
     width = max(len(name) for name, _ in rows)
     lines = [f"{name.ljust(width)}  {value}" for name, value in rows]
-    return "\n".join([*lines, "", printable(result.message)])
+    return "\n".join([*_first(result.coverage), *lines, "", printable(result.message)])
+
+
+def _first(found: Any) -> list[str]:
+    """Return what is said before all else: that little can be stabilized, where that is so."""
+    if not 0 < found.stabilizable < LITTLE * found.free:
+        return []
+    return [f"only {found.stabilizable} of {found.free} free cells can be stabilized", ""]
 
 
 def _improved(steps: int | None) -> str:

@@ -51,6 +51,8 @@ class _Fault(NamedTuple):
     """Path of the key that an unknown key was probably meant to be."""
     known: str = ""
     """The keys that are known there, to be said once."""
+    instead: str | None = None
+    """Of a key that stands elsewhere in another kind: the path of what it stands in."""
 
 
 def condensed(
@@ -63,13 +65,20 @@ def condensed(
     items = error.errors(include_url=False)
     faults = [_fault(item, model) for item in items if not _follows(item)]
     meant = {fault.meant for fault in faults if fault.meant}
-    faults = [fault for fault in faults if fault.where not in meant or fault.message != _ADD]
+    instead = {fault.instead for fault in faults}  # what is missing there is said by these
+    faults = [
+        fault for fault in faults
+        if fault.message != _ADD
+        or (fault.where not in meant and fault.where.rpartition(".")[0] not in instead)
+    ]  # fmt: skip
     faults.sort(key=lambda fault: fault.meant is None)
     said: set[str] = set()
     found = []
     for fault in faults:
+        if fault.instead is not None and fault.message in said:
+            continue
         found.append(BadInput(fault.message + fault.known * (fault.known not in said), fault.where))
-        said.add(fault.known)
+        said |= {fault.known, fault.message}
     if all(item["loc"] for item in items):
         found += more()
     return together(found)
@@ -124,7 +133,20 @@ def _fault(item: Mapping[str, Any], model: type[BaseModel]) -> _Fault:
         return _Fault(where, f"a Python function is not accepted here; {FUNCTIONS}")
     limits = {key: _plain(value) for key, value in item.get("ctx", {}).items()}
     fix = fix.format(**limits) if fix else item["msg"]
+    if kind == "int_type" and isinstance(_plain(item["input"]), int):
+        fix = f"write {_plain(item['input'])}, without a point"
+    if kind == "model_type":
+        fix += _form(_models(model, location))
     return _Fault(where, f"{written(item['input'])} is not accepted; {fix}")
+
+
+def _form(models: Sequence[type[BaseModel]]) -> str:
+    """Return the keys that a part must have, where there is one form of it."""
+    if len(set(models)) != 1:
+        return ""
+    needed = [name for name, field in models[0].model_fields.items() if field.is_required()]
+    keys = ", ".join(f'"{name}": ...' for name in needed)
+    return f": {{{keys}}}" if keys else ""
 
 
 def written(value: Any, limit: int = 120) -> str:
@@ -162,7 +184,7 @@ def _plain(value: Any) -> Any:
 def _unknown(where: str, location: tuple[int | str, ...], model: type[BaseModel]) -> _Fault:
     for kind in _models(model, location[:-1]):
         if said := getattr(kind, "elsewhere", {}).get(location[-1]):
-            return _Fault(where, said)
+            return _Fault(where, said, instead=_path(location[:-1]))
     allowed = sorted({key for kind in _models(model, location[:-1]) for key in kind.model_fields})
     near = spelling.nearest(str(location[-1]), allowed, spelling.KEYS)
     if near is None and "kind" not in allowed:  # of several forms, another one

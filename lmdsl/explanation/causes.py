@@ -14,7 +14,7 @@ from lmdsl.explanation import finite, one_cell, whole_cell
 from lmdsl.explanation.changes import every_hint
 from lmdsl.explanation.hints import Hint
 from lmdsl.explanation.lost_mass import PhaseOne
-from lmdsl.explanation.meanings import meanings
+from lmdsl.explanation.meanings import LostCells, meanings, unheld
 from lmdsl.explanation.one_cell import NAMES, Why
 from lmdsl.explanation.whole_cell import WholeCells
 from lmdsl.machine.deadline import Deadline
@@ -26,35 +26,13 @@ from lmdsl.model.assembly.substeps import settled
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.discretization import control_count
 from lmdsl.model.grid import boxes
-from lmdsl.model.grid.boxes import Area, Region
+from lmdsl.model.grid.boxes import Area
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.problem import Problem, given
 from lmdsl.systems import MatrixSystem
-
-
-@dataclass(frozen=True)
-class LostCells:
-    """The cells that one cause keeps outside C.
-
-    Attributes
-    ----------
-    name
-        ``escapes``, ``trapped`` or ``leads to these``.
-    cells
-        How many there are.
-    regions
-        Disjoint boxes of such cells only, largest first.
-    elsewhere
-        Number of the cells in none of these boxes.
-    """
-
-    name: str
-    cells: int
-    regions: tuple[Region, ...]
-    elsewhere: int
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -89,6 +67,11 @@ class Explanation(Frozen):
     def lost(self) -> int:
         """Number of cells outside C, A and avoid."""
         return sum(cause.cells for cause in self.causes)
+
+    @cached_property
+    def unheld(self) -> str | None:
+        """Why no attractor cell holds, where the problem asks that some do; None else."""
+        return unheld(self.problem, self.partition, self.cell_status)
 
     @cached_property
     def transitions(self) -> Transitions:
@@ -186,6 +169,7 @@ class Explanation(Frozen):
             "cells": self.partition.size,
             "stabilizable_cells": int((self.cell_status == CellStatus.STABILIZED).sum()),
             "lost_cells": self.lost,
+            "unheld": self.unheld,
             "causes": causes,
             "hints": [hint.to_dict() for hint in self.hints],
             "phase_one": self.phase_one and self.phase_one.to_dict(),
@@ -193,9 +177,9 @@ class Explanation(Frozen):
 
     def text(self) -> str:
         """Return the explanation for people."""
-        stabilizable = int((self.cell_status == CellStatus.STABILIZED).sum())
-        lines = [f"{self.lost} of {self.lost + stabilizable} free cells cannot be "
-                 "stabilized"]  # fmt: skip
+        free = self.lost + int((self.cell_status == CellStatus.STABILIZED).sum())
+        lines = [f"{self.lost} of {free} free cells cannot be stabilized"]
+        lines += ["", self.unheld] if self.unheld else []
         meaning = meanings(self.problem)
         finite_model = isinstance(self.problem.system, MatrixSystem)
         for cause in self.causes:

@@ -1,7 +1,13 @@
 """What the causes mean, in words, by what a problem asks for."""
 
+from dataclasses import dataclass
+
+from lmdsl.common.types import Statuses
 from lmdsl.explanation import finite
 from lmdsl.explanation.one_cell import NAMES
+from lmdsl.model.grid.boxes import Region
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local import holding
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.systems import MatrixSystem
@@ -13,6 +19,28 @@ MEANING = {
     CellStatus.LEADS_TO_THESE: "the attractor can be reached, but not without the risk of a cell "
     "that is lost",
 }
+
+
+@dataclass(frozen=True)
+class LostCells:
+    """The cells that one cause keeps outside C.
+
+    Attributes
+    ----------
+    name
+        ``escapes``, ``trapped`` or ``leads to these``.
+    cells
+        How many there are.
+    regions
+        Disjoint boxes of such cells only, largest first.
+    elsewhere
+        Number of the cells in none of these boxes.
+    """
+
+    name: str
+    cells: int
+    regions: tuple[Region, ...]
+    elsewhere: int
 
 
 def meanings(problem: Problem) -> dict[str, str]:
@@ -29,3 +57,10 @@ def meanings(problem: Problem) -> dict[str, str]:
     if problem.ends_in_time:
         meaning[CellStatus.LEADS_TO_THESE] = "no control is without the risk of a cell that is lost"
     return {NAMES[status]: text for status, text in meaning.items()}
+
+
+def unheld(problem: Problem, partition: Partition, status: Statuses) -> str | None:
+    """Return why no attractor cell holds; None where some does, or none is asked to."""
+    if (status == CellStatus.ATTRACTOR).any():
+        return None
+    return holding.unheld(problem, partition)

@@ -13,11 +13,13 @@ import numpy as np
 
 from lmdsl.common.types import Floats
 from lmdsl.errors import BadInput
+from lmdsl.explanation.one_cell import NAMES
 from lmdsl.explanation.trials import MapTrial
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model import stabilizable_set
 from lmdsl.model.assembly import estimates
 from lmdsl.model.assembly.substeps import settled
+from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.grid import boxes
 from lmdsl.model.grid.axis import EDGE
 from lmdsl.model.grid.partition import Partition
@@ -44,6 +46,8 @@ class StabilizableShare(NamedTuple):
 
     stabilizable: int
     free: int
+    lost: Mapping[str, int] = {}
+    """How many of the others there are by cause, by its name."""
 
     @property
     def share(self) -> float:
@@ -59,7 +63,14 @@ def coverage(problem: Problem, deadline: Deadline | None = None) -> Stabilizable
     partition = Partition.of(problem)
     transitions = holding.assembled(problem, partition, deadline=deadline)
     found = stabilizable_set.of_transitions(problem, partition, transitions, deadline)
-    return StabilizableShare(int(found.inside.sum()), len(found.inside))
+    return counted(transitions, found)
+
+
+def counted(transitions: Transitions, found: stabilizable_set.Stabilizable) -> StabilizableShare:
+    """Return how much can be stabilized, and the causes of the others."""
+    status = stabilizable_set.statuses(transitions, found)
+    lost = {NAMES[code]: int((status == code).sum()) for code in stabilizable_set.LOST}
+    return StabilizableShare(int(found.inside.sum()), len(found.inside), lost)
 
 
 def cheap(problem: Problem, most: float) -> bool:

@@ -30,6 +30,7 @@ from lmdsl.results.summary import Coverage, Seconds
 from lmdsl.systems import DataSystem
 
 UNKNOWN = 255  # status of cells of which nothing is known
+LITTLE = 0.1  # share of cells that can be stabilized below which that is said first
 
 
 def not_compiled(
@@ -142,6 +143,11 @@ class _Job:
         """Return what a verified controller does."""
         lp, free = self.lp, Coverage.of(self.lp.cell_status).free
         cells = f"every one of {lp.n} cells (of {free} free)"
+        if lp.n < LITTLE * free and not lp.problem.ends_in_time:
+            return (
+                f"only {lp.n} of {free} free cells can be stabilized: the controller brings every "
+                "one of these to the attractor"
+            )
         if lp.problem.attractor.empty:
             return f"discounted, no target: the controller keeps {cells} among them"
         if lp.problem.ends_in_time:

@@ -248,3 +248,22 @@ def test_whatever_is_wrong_is_one_message(seed):
             said_of.append(str(error))
     assert len(said_of) > 200
     assert not [text for text in said_of if "\n" in text]
+
+
+def test_what_a_function_is_not_is_all_that_is_said():
+    for more in ({}, {"step": 0.1}):
+        with pytest.raises(lm.BadInput) as caught:
+            lm.systems.FunctionSystem(derivative=lambda x: x, **more)
+        assert str(caught.value).startswith("derivative: a FunctionSystem is a map")
+        assert "missing" not in str(caught.value)
+        assert str(caught.value).count("is a map") == 1
+    with pytest.raises(lm.BadInput, match="next: required key is missing"):
+        lm.systems.FunctionSystem()
+
+
+def test_forms_and_whole_numbers_are_written_out():
+    form = '{"low": ..., "high": ..., "points": ...}'
+    uniform = said(noise={"w": {"uniform": [-0.03, 0.03]}})
+    assert uniform.endswith(f"write an object in braces: {form}")
+    assert said(sampling={"kind": "grid", "per_axis": 7.0}).endswith("write 7, without a point")
+    assert said(sampling={"kind": "grid", "per_axis": 7.5}).endswith("write a whole number")

@@ -177,6 +177,14 @@ def _cheapest(transitions: Transitions, alive: Bools) -> Controls:
     return cheapest
 
 
+def unheld(problem: Problem, partition: Partition, deadline: Deadline | None = None) -> str | None:
+    """Return why no attractor cell holds; None where some does, or none is asked to."""
+    if not isinstance(problem.local_controller, HoldControl):
+        return None
+    index = held(problem, partition, CellSets.of(problem, partition, deadline), deadline)
+    return why_none(problem, partition, deadline) if none_holds(index) else None
+
+
 def why_none(problem: Problem, partition: Partition, deadline: Deadline | None = None) -> str:
     """Return why no attractor cell holds, and what to do, as far as a look at the middles tells."""
     said = "no attractor cell holds: under every control some successors leave the set; "
