@@ -47,7 +47,6 @@ def run(parsed: Arguments) -> int:
 
 def _draw(parsed: Arguments, stored: Any, path: Path, axes: list[str] | None, at: Any) -> None:
     from lmdsl import plotting
-    from lmdsl.results.directory import proved
 
     result, what = stored.result, (parsed.quantity, parsed.control)
     if parsed.draw == "slices":
@@ -59,9 +58,8 @@ def _draw(parsed: Arguments, stored: Any, path: Path, axes: list[str] | None, at
     elif path.suffix.lower() in FILMS:
         plotting.animate(result, path, axes=axes, at=at, project=parsed.project)
     else:
-        proof = proved.as_stored(parsed.dir, result, stored.certificate.proof)
         cut: Any = {"axes": axes, "at": at, "project": parsed.project}
-        plotting.figure(result, path, proof=proof, **cut)
+        plotting.figure(result, path, proof=result.proof, **cut)
 
 
 def places(text: str) -> dict[str, float | list[float]]:

@@ -1,9 +1,10 @@
 """Records: arrays in them are never written to, two can be compared, all are plain JSON data."""
 
 import math
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,3 +110,28 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, np.integer):
         return int(value)
     return value
+
+
+class Unread(NamedTuple):
+    """What a field holds until it is read from its file."""
+
+    read: Callable[[], Any]
+
+
+class Later:
+    """A field with the default None that may hold :class:`Unread`."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    def __get__(self, record: Any, owner: type) -> Any:
+        """Return the value, read by now."""
+        if record is None:
+            return None  # the default
+        held = vars(record)[self.name]
+        if isinstance(held, Unread):
+            held = vars(record)[self.name] = held.read()
+        return held
+
+    def __set__(self, record: Any, value: Any) -> None:
+        vars(record)[self.name] = value

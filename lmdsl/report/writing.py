@@ -23,7 +23,7 @@ from lmdsl.proof.record import Proof
 from lmdsl.report.gathering import Beside, gathered
 from lmdsl.report.page import page
 from lmdsl.results.comparison import Comparison
-from lmdsl.results.directory import archive, proved, writing
+from lmdsl.results.directory import archive, writing
 from lmdsl.results.result import Result
 from lmdsl.results.verification import Verification, recompiled, verify
 
@@ -93,7 +93,6 @@ def write_directory(
     _library()  # before the work
     stored = archive.read(directory)
     result = stored.result
-    proof = proved.as_stored(directory, result, stored.certificate.proof)
     lp, missing = _model(result, lambda: recompiled(directory, result, progress, time_limit))
     found = verify(directory, progress=progress, time_limit=time_limit) if check else None
     comparison = None
@@ -103,7 +102,7 @@ def write_directory(
             progress=progress,
         )  # fmt: skip
     made_by = stored.certificate.versions
-    asked = Beside(lp, proof, comparison, found, str(directory), missing, made_by)
+    asked = Beside(lp, result.proof, comparison, found, str(directory), missing, made_by)
     _write(result, target, asked, inputs.seed(seed), progress)
     return target, found
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lmdsl.certificate import sums
 from lmdsl.certificate.claims import Certificate
 from lmdsl.common import inputs
-from lmdsl.common.records import freeze
+from lmdsl.common.records import Later, freeze
 from lmdsl.common.types import Bools, Floats, Progress, Statuses, told
 from lmdsl.control.questions import InUse
 from lmdsl.errors import BadInput, shown
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
     from lmdsl.model.lp import StabilizationLP
     from lmdsl.proof.record import Proof
+
+_LATER: Any = Later()
 
 
 @dataclass(frozen=True, kw_only=True, repr=False, eq=False)
@@ -62,7 +64,8 @@ class Result(Paged, Carried, Summary, InUse):
     dropped, declared_lower
         Pairs (cell, control) dropped by repair, (D, 2), and W of the model with all, (N,); or None.
     proof
-        Of a problem solved with ``proved``: what becomes of C; None for a loaded result.
+        What becomes of C: of a problem solved with ``proved``, or of a directory that holds a
+        proof, read unchecked when it is first asked for; else None.
     iterations
         Iterations in the backend's own sense.
     log
@@ -90,7 +93,7 @@ class Result(Paged, Carried, Summary, InUse):
     sure_levels: NDArray[np.int32] | None = None
     dropped: NDArray[np.int64] | None = None
     declared_lower: Floats | None = None
-    proof: Proof | None = None
+    proof: Proof | None = _LATER
     iterations: int | None = None
     log: str = ""
     gap_before_polish: float | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -210,8 +211,10 @@ def test_a_directory_keeps_what_was_dropped_and_is_checked(repaired, saved):
     assert stored["proved"]["arrives"] == repaired.proved.arrives
 
 
-def test_a_loaded_result_saved_again_says_no_share_until_it_is_proved(saved, tmp_path):
-    lm.Result.load(saved).save(tmp_path / "again")
+def test_a_result_saved_without_its_proof_says_no_share_until_it_is_proved(saved, tmp_path):
+    lm.Result.load(saved).save(tmp_path / "kept")
+    assert lm.Result.load(tmp_path / "kept").proved.reached
+    replace(lm.Result.load(saved), proof=None).save(tmp_path / "again")
     assert lm.Result.load(tmp_path / "again").proved.arrives is None
     assert lm.verify(tmp_path / "again").holds
     assert main(["prove", str(tmp_path / "again")]) == 0

@@ -11,6 +11,7 @@ import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
 from lmdsl.common import arrays, inputs
 from lmdsl.common.files import MAX_FILE_BYTES, parsed, reason
-from lmdsl.common.records import jsonable
+from lmdsl.common.records import Unread, jsonable
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.model.discretization import control_count, control_vectors
@@ -124,7 +125,7 @@ def _certificate(result: Result) -> dict[str, Any]:
         "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
         "versions": versions(),
         "scope": scope(result.problem),
-        "proof": proved.said_of(result.proof),  # that of a loaded result is one of another save
+        "proof": proved.said_of(result.proof),
         "proved": repaired.now(result, result.proof),
     }
     return {
@@ -240,6 +241,9 @@ def _read(files: Reading) -> Stored:
     )
     vectors |= repaired.read(files, stored.proved, N, M)
     result = _result(problem, partition, stored, vectors)
+    if stored.proof is not None:
+        read = partial(proved.as_stored, files.folder.absolute(), result, stored.proof)
+        vars(result)["proof"] = Unread(read)
     return Stored(result, stored, tuple(files.rewritten))
 
 

@@ -1,7 +1,6 @@
 """The proof of a result, and what its directory says of it: proof.npz and certificate.json."""
 
 import os
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -21,7 +20,10 @@ from lmdsl.model.local.holding import HoldingLaw
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.proof import checking
 from lmdsl.proof.bounds.flights.checking import checked_above
+from lmdsl.proof.bounds.flights.refining import Above
+from lmdsl.proof.bounds.optimum.bracket import Optimum
 from lmdsl.proof.bounds.optimum.checking import checked
+from lmdsl.proof.bounds.optimum.parts import fits
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.proving import Ending
 from lmdsl.proof.proving import prove as proved
@@ -162,15 +164,16 @@ def read(path: str | os.PathLike[str], result: Result, said: ProofKeys) -> dict[
     memory.require(2.0 * each * said.boxes + more, "the boxes of the proof")
 
     def boxes(files: Reading) -> dict[str, NDArray[Any]]:
+        held = files.certificate.get("proof")
+        if not isinstance(held, dict) or held.get("sha256", "") != said.sha256:
+            raise BadInput("another proof replaced it in the directory; load it again", NAME)
         return arrays.unpacked(files.open(NAME, arrays.largest(shapes)), NAME, shapes)
 
     return reading.read(writing.place(path), boxes)
 
 
 def as_stored(path: str | os.PathLike[str], result: Result, said: ProofKeys | None) -> Proof | None:
-    """Return the proof of a directory without its bounds on parts, unchecked; None without one.
-
-    What rests on these bounds is what the certificate says.
+    """Return the proof of a directory, unchecked; None without one.
 
     BadInput: it cannot be read.
     """
@@ -180,8 +183,18 @@ def as_stored(path: str | os.PathLike[str], result: Result, said: ProofKeys | No
     wrong = checking.malformed(loop, found)
     if wrong:
         raise BadInput(wrong.removeprefix(f"{NAME}: "), NAME)
-    proof = Proof.of(found, loop, seconds=said.seconds, holds=said.holds, target=said.target)
-    return replace(proof, cost=said.cost, optimum=said.optimum, nonnegative=said.nonnegative)
+    above = Above(found["above_split"], found["above"]) if said.followed is not None else None
+    bound = None
+    if said.parts is not None:
+        nonnegative = bool(said.nonnegative)
+        bound = Optimum(found["optimum_split"], found["optimum"], nonnegative)
+    for split, parts in (x[:2] for x in (above, bound) if x is not None):
+        if not fits(loop.partition, split, len(parts)):
+            raise BadInput("the bounds do not fit the number of their parts", NAME)
+    return Proof.of(
+        found, loop, seconds=said.seconds, holds=said.holds, target=said.target, above=above,
+        bound=bound,
+    )  # fmt: skip
 
 
 def note(said: ProofKeys) -> str:

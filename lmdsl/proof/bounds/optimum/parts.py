@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lmdsl.common.types import Indices
 from lmdsl.machine.kernels import kernel
@@ -32,6 +33,15 @@ class Parts(NamedTuple):
         """Return the cells of parts."""
         stride = np.array([axis.stride for axis in partition.axes]).astype(np.int64)
         return np.asarray(((self.by_axis(part) >> self.split) * stride).sum(axis=1))
+
+
+DEEPEST = 20  # bisections of an axis
+
+
+def fits(partition: Partition, split: NDArray[np.uint8], count: int) -> bool:
+    """Return whether cells cut so often have so many parts."""
+    small = bool((split <= DEEPEST).all())
+    return small and Parts.of(partition, split.astype(np.int64)).size == count
 
 
 @kernel
