@@ -11,7 +11,6 @@ import os
 import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
 from lmdsl.common import arrays, inputs
 from lmdsl.common.files import MAX_FILE_BYTES, parsed, reason
-from lmdsl.common.records import Unread, jsonable
+from lmdsl.common.records import jsonable
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.model.discretization import control_count, control_vectors
@@ -241,9 +240,7 @@ def _read(files: Reading) -> Stored:
     )
     vectors |= repaired.read(files, stored.proved, N, M)
     result = _result(problem, partition, stored, vectors)
-    if stored.proof is not None:
-        read = partial(proved.as_stored, files.folder.absolute(), result, stored.proof)
-        vars(result)["proof"] = Unread(read)
+    proved.attach(files.folder, result, stored.proof)
     return Stored(result, stored, tuple(files.rewritten))
 
 

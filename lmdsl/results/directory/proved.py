@@ -2,13 +2,14 @@
 
 import os
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common import arrays, inputs
-from lmdsl.common.records import jsonable
+from lmdsl.common.records import Unread, jsonable
 from lmdsl.common.types import Bools, Guard, Progress
 from lmdsl.control.invariance import keeping
 from lmdsl.errors import BadInput, shown
@@ -195,6 +196,13 @@ def as_stored(path: str | os.PathLike[str], result: Result, said: ProofKeys | No
         found, loop, seconds=said.seconds, holds=said.holds, target=said.target, above=above,
         bound=bound,
     )  # fmt: skip
+
+
+def attach(folder: Path, result: Result, said: ProofKeys | None) -> None:
+    """Let a result that was read from a folder have its proof, once it is asked for."""
+    if said is not None:
+        later = partial(as_stored, folder.absolute(), result, said)
+        vars(result)["proof"] = Unread(later)
 
 
 def note(said: ProofKeys) -> str:
