@@ -189,10 +189,10 @@ def _sets(result: Result) -> Iterable[DeclaredRow]:
         yield _row("attractor A", "none")
     else:
         text, *math = _set(problem, problem.attractor, _which(problem.attractor))
-        yield _row("attractor A", f"{_counted(result, CellStatus.ATTRACTOR)}: {text}", *math)
+        yield _row("attractor A", f"{_counted(result, CellStatus.ATTRACTOR)} {text}", *math)
     if problem.avoid is not None:
         text, *math = _set(problem, problem.avoid, "all that meet")
-        yield _row("avoid Z", f"{_counted(result, CellStatus.AVOID)}: {text}", *math)
+        yield _row("avoid Z", f"{_counted(result, CellStatus.AVOID)} {text}", *math)
     measure = problem.measure
     if measure is None:
         yield _row("starts m", "every stabilizable cell with the same weight")
@@ -219,8 +219,10 @@ def _counted(result: Result, status: CellStatus) -> str:
     count = int(np.count_nonzero(result.cell_status == status))
     text, local = f"{count:,} cell{'s' * (count != 1)}", result.local_controller
     if status == CellStatus.ATTRACTOR and local is not None and local.holding is not None:
-        return f"{text}, {local.holding:,} of which hold what arrives"
-    return text
+        if local.holding == count:  # the others, if any, are ordinary cells
+            return f"{text} that hold{'s' * (count == 1)} what arrives, of"
+        text += f", of which {local.holding:,} hold{'s' * (local.holding == 1)} what arrives"
+    return f"{text}:"
 
 
 def _some(measure: Measure) -> bool:

@@ -153,11 +153,17 @@ def test_the_cells_of_the_attractor_are_counted_and_named(attractor, cells, whic
     assert rows["attractor A"]["text"].startswith(f"{cells}: {which}")
 
 
-def test_cells_that_hold_are_counted():
-    held = {"kind": "hold"}
-    result, rows = told_of(local_controller=held, attractor={"boxes": [{"x": [0, 0.5]}]})
-    held = result.local_controller.holding
-    assert f"cells, {held} of which hold what arrives" in rows["attractor A"]["text"]
+@pytest.mark.parametrize(("partial", "said"), [
+    (True, "2 cells, of which 1 holds what arrives: those wholly inside a box"),
+    (False, "1 cell that holds what arrives, of those wholly inside a box"),
+])  # fmt: skip
+def test_cells_that_hold_are_counted(partial, said):
+    """Of 4 cells the second is kept; from the first runs go to the third, and from there back."""
+    image = "where(x < 0.25, x + 0.5, where(x < 0.5, x, x - 0.25*u))"
+    system = {"kind": "map", "next": {"x": image}}
+    held = {"kind": "hold", "partial": partial}
+    _, rows = told_of(local_controller=held, attractor={"boxes": [{"x": [0, 0.5]}]}, system=system)
+    assert rows["attractor A"]["text"] == said
 
 
 def test_cells_that_are_avoided_are_counted():
