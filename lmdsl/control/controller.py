@@ -19,7 +19,7 @@ Law = Literal["constant", "interpolated"]
 JUMP = 0.25  # share of a control's range by which it may differ within a branch
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Controller(Frozen):
     """A feedback law that is constant on each cell.
 
@@ -42,6 +42,16 @@ class Controller(Frozen):
     local: LocalController | None = None
 
     mode: ClassVar[Law] = "constant"
+
+    def __str__(self) -> str:
+        covered = int((self.index >= 0).sum())
+        inside = "" if self.local is None else ", and a feedback on the attractor cells"
+        return (
+            f"Controller of {', '.join(self.partition.names)}: constant on each of {covered:,} "
+            f"cells (of {len(self.index):,}), one of {len(self.vectors):,} controls{inside}"
+        )
+
+    __repr__ = __str__
 
     @own_arithmetic
     def __call__(self, x: ArrayLike, mode: Law = "constant") -> Floats:

@@ -96,7 +96,8 @@ def test_reports_are_shown_as_they_are_printed(result, tmp_path):
         lm.explain(trapped), lm.solve(made(steps())).prove(),
     ):  # fmt: skip
         assert text(shown) == str(shown)
-    assert result.controller._repr_html_() is None  # it has no words
+    assert text(result.controller) == str(result.controller) == repr(result.controller)
+    assert str(result.controller).startswith("Controller of x, y: constant on each of ")
     assert result.coverage._repr_html_() == f"<pre>{result.coverage}</pre>"
 
 
