@@ -99,7 +99,7 @@ def test_check_prints_json(capsys, file):
     assert status == 1
     (finding,) = found["findings"]
     assert {*finding} == {"code", "where", "text", "remedy", "figures"}
-    assert {*found} == {"findings", "expected", "axes"}
+    assert {*found} == {"findings", "expected", "axes", "notes", "suggestion"}
     assert found["expected"]["coverage"] == 1
     data["stage_cost"] = "-1"
     status, found = run_json(capsys, "check", file(data))
