@@ -67,7 +67,7 @@ def prove(
         left *= 1.0 - CHANCE
         deadline = Deadline(left)
     flights = Flights(loop, SLACK, RAISED)
-    bounded = _work((prover, flights), loop, target, deadline, progress, ending)
+    bounded, stopped = _work((prover, flights), loop, target, deadline, progress, ending)
     arrays = boxes(prover, chances(prover, Deadline(left and CHANCE * left)) if likely else None)
     leaves = prover.cover.leaves()
     leaves = leaves[(prover.cover.tree.images[leaves] > 0)]
@@ -79,15 +79,19 @@ def prove(
     bound = best(loop, *_most(arrays, partition.size), whole, progress, SLACK) if bracket else None
     seconds = time.monotonic() - began
     return Proof.of(
-        arrays, loop, seconds=seconds, holds=kept, target=target, above=above, bound=bound
-    )
+        arrays, loop, seconds=seconds, holds=kept, target=target, above=above, bound=bound,
+        stopped=stopped,
+    )  # fmt: skip
 
 
 def _work(
     own: tuple[Prover, Flights], loop: Loop, target: float, deadline: Deadline,
     progress: Progress | None, ending: Ending | None,
-) -> bool:  # fmt: skip
-    """Decide what becomes of boxes, then tighten the bounds of the cost; return whether it did."""
+) -> tuple[bool, bool]:  # fmt: skip
+    """Decide what becomes of boxes, then tighten the bounds of the cost; return whether it did.
+
+    And whether there was no time to decide more.
+    """
     prover, flights = own
 
     def ended() -> bool:
@@ -102,17 +106,19 @@ def _work(
         return bool(shares[LOST] + shares[STAYS] > 0) and ended()
 
     left = deadline.left
-    prover.run(enough, Deadline(left and DECIDING * left), progress)
+    until = Deadline(left and DECIDING * left)
+    prover.run(enough, until, progress)
+    stopped = until()
     few = max(GROWN * len(prover.cover.leaves()), FEW)
     if ended():
         leaves = arriving(prover)
         settling.refine(prover.search, leaves, prover.factor, np.zeros(len(leaves)))
-        return False
+        return False, stopped
     some = deadline
     if flights.able and deadline.left is not None:
         some = Deadline(BOXED * deadline.left)
     tighten(prover, lambda boxes: left is None and boxes > few, some, progress)
-    return True
+    return True, stopped
 
 
 def _decided(prover: Prover) -> tuple[Indices, Statuses, NDArray[np.int32]]:

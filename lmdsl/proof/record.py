@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from lmdsl.common.records import Frozen, jsonable
 from lmdsl.common.types import Floats
+from lmdsl.model.grid.whereabouts import Whereabouts
 from lmdsl.proof.bounds.flights.refining import Above
 from lmdsl.proof.bounds.optimum.averages import Bracket, mean, means, volumes
 from lmdsl.proof.bounds.optimum.bracket import Optimum
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.search import ARRIVES, LOST, STAYS, UNDECIDED
-from lmdsl.proof.whereabouts import Whereabouts
 
 _WITNESSES = {
     "lost": "runs are lost", "stays": "runs stay elsewhere", "undecided": "it is undecided",
@@ -106,6 +106,8 @@ class Proof(Frozen):
         The same from every box, (B,); None likewise.
     where
         Of what is ``lost``, ``stays`` or is ``undecided`` the fewest cells that hold half of it.
+    stopped
+        Whether the time limit ended it before the target was reached.
     maps
         Its means over what arrives of each cell, and those of ``cost_above``, shape (N,) each; NaN
         where nothing arrives.
@@ -138,11 +140,13 @@ class Proof(Frozen):
     probability: float | None = None
     chance: Floats | None = None
     where: dict[str, Whereabouts | None] = field(default_factory=dict)
+    stopped: bool = False
 
     @classmethod
     def of(
         cls, arrays: dict[str, NDArray[Any]], loop: Loop, *, seconds: float, holds: bool | None,
         target: float, above: Above | None = None, bound: Optimum | None = None,
+        stopped: bool = False,
     ) -> Self:  # fmt: skip
         """Return the proof that boxes are."""
         kind, volume = arrays["class"], volumes(arrays["split"])
@@ -177,7 +181,7 @@ class Proof(Frozen):
             {
                 name: Whereabouts.of(loop.partition, arrays["cell"], volume, kind == state)
                 for name, state in (("lost", LOST), ("stays", STAYS), ("undecided", UNDECIDED))
-            },
+            }, stopped and share(STAYS if loop.to_stay else ARRIVES) < target,
         )  # fmt: skip
 
     @property
@@ -228,7 +232,7 @@ class Proof(Frozen):
         """Return plain data for JSON."""
         names = ("arrives", "lost", "stays", "undecided", "steps", "cost", "boxes", "seconds",
                  "holds", "witnesses", "followed", "optimum", "nonnegative", "parts",
-                 "probability", "where")  # fmt: skip
+                 "probability", "where", "stopped")  # fmt: skip
         return {name: jsonable(getattr(self, name)) for name in names}
 
     def text(self) -> str:
@@ -270,6 +274,8 @@ class Proof(Frozen):
             lines.append(f"  that what arrives stays in the attractor is {held}")
         lines.append(f"  {self.boxes:,} boxes, {self.seconds:.1f} s; target {self.target:.6g} is "
                      f"{'reached' if self.reached else 'not reached'}")  # fmt: skip
+        if self.stopped:
+            lines.append("  stopped by the time limit; a longer one decides more")
         return "\n".join(lines)
 
     __str__ = text

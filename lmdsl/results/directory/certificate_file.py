@@ -78,6 +78,7 @@ class ProofKeys(_Keys):
     nonnegative: bool | None = None
     parts: Annotated[int, Field(ge=0, lt=2**31)] | None = None
     probability: float | None = None
+    stopped: bool = False
 
 
 class CertificateFile(_Keys):

@@ -29,6 +29,7 @@ from lmdsl.proof.loop import Loop
 from lmdsl.proof.proving import Ending
 from lmdsl.proof.proving import prove as proved
 from lmdsl.proof.record import BOX, Proof, expected
+from lmdsl.proof.warming import warm
 from lmdsl.results.directory import reading, repaired, writing
 from lmdsl.results.directory.certificate_file import ProofKeys
 from lmdsl.results.directory.reading import Reading
@@ -63,8 +64,11 @@ def prove(
         raise BadInput(
             "there is no controller of which anything could be proved: " + result.message
         )
-    held = partial(holds, result)
-    return proved(loop_of(result), target, deadline, held, progress, bracket, ending)
+    held, loop = partial(holds, result), loop_of(result)
+    if time_limit is not None:
+        warm(loop, bracket, progress)
+        deadline = Deadline.of(time_limit)  # begins when the kernels are compiled
+    return proved(loop, target, deadline, held, progress, bracket, ending)
 
 
 def loop_of(result: Result) -> Loop:
@@ -194,7 +198,7 @@ def as_stored(path: str | os.PathLike[str], result: Result, said: ProofKeys | No
             raise BadInput("the bounds do not fit the number of their parts", NAME)
     return Proof.of(
         found, loop, seconds=said.seconds, holds=said.holds, target=said.target, above=above,
-        bound=bound,
+        bound=bound, stopped=said.stopped,
     )  # fmt: skip
 
 
