@@ -31,7 +31,7 @@ def long_step(survey: Survey, share: float | None, deadline: Deadline) -> Iterat
     """
     if survey.sets is None or survey.problem.judged == "path" or not len(survey.cells):
         return
-    near = _beside(survey.partition, survey.sets.attractor, survey.sets.free)
+    near = beside(survey.partition, survey.sets.attractor, survey.sets.free)
     if not len(near):
         return
     if remedies.longer_step(survey.problem, 1) is None:
@@ -121,7 +121,7 @@ def _of_map(survey: Survey, share: float | None, cells: Indices) -> Iterator[Fin
     yield Finding("long_step", "attractor", text, remedy, figures)
 
 
-def _beside(p: Partition, attractor: Bools, free: Indices) -> Indices:
+def beside(p: Partition, attractor: Bools, free: Indices) -> Indices:
     """Return free cells beside attractor cells, at most so many."""
     random = np.random.default_rng(0)
     inside = np.flatnonzero(attractor)

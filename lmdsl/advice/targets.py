@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 
 from lmdsl.advice.declaration import unsteered
+from lmdsl.advice.jumps import beside
 from lmdsl.advice.report import Finding
 from lmdsl.advice.sizes import Level
 from lmdsl.advice.survey import Survey
@@ -102,7 +103,8 @@ def chance(survey: Survey) -> Iterator[Finding]:
         return
     ends = [(float(a.min()), float(b.max())) for a, b in (x.parts() for x in noises.values())]
     corners = np.array(list(product(*ends)))
-    cells = some(survey.cells, PLACES)
+    near = beside(p, survey.sets.attractor, survey.sets.free)  # where noise may be narrower
+    cells = np.union1d(some(survey.cells, PLACES), some(near, PLACES))
     if not len(cells):
         return
     noise = list(np.ascontiguousarray(corners.T)[:, None, None, None, :])
@@ -120,9 +122,9 @@ def chance(survey: Survey) -> Iterator[Finding]:
         yield Finding(
             "noise_too_wide",
             "noise",
-            f"a step spreads noise over {wide:.3g} cells of {name} at least, and the attractor is "
-            f"{run} long there: under no control does a step surely arrive, only by chance, so "
-            "that `prove` can prove nothing",
+            f"in all cells tried a step spreads noise over {wide:.3g} cells of {name} or more, and the "
+            f"attractor is {run} long there: under no control does a step surely arrive, only by "
+            "chance, so that `prove` can prove nothing",
             f"make the attractor longer along {name} than {math.ceil(wide)} cells, or noise "
             "narrower",
             {"axis": name, "noise": wide, "attractor": run},

@@ -130,6 +130,14 @@ def test_noise_wider_than_the_attractor():
     assert "noise_too_wide" not in found(noisy(0.6, attractor={"boxes": [{"x": [-1, 1]}]}))
 
 
+def test_noise_that_is_narrower_beside_the_attractor():
+    data = noisy(0.5, cells=4_000, attractor={"boxes": [{"x": [-0.02, 0.02]}]})
+    data["system"]["next"] = {"x": "0.5*x + w*x + 0*u"}
+    assert "noise_too_wide" not in found(data)
+    data["noise"]["w"]["uniform"] |= {"low": -1, "high": 1.5}
+    assert "noise_too_wide" in found(data)
+
+
 def test_rows_of_cells():
     rng = np.random.default_rng(0)
     for periodic in (False, True):
