@@ -123,8 +123,8 @@ def chance(survey: Survey) -> Iterator[Finding]:
             "noise_too_wide",
             "noise",
             f"in all cells tried a step spreads noise over {wide:.3g} cells of {name} or more, "
-            f"and the attractor is {run} long there: under no control does a step surely arrive, only "
-            "by chance, so that `prove` can prove nothing",
+            f"and the attractor is {run} long there: under no control does a step surely arrive, "
+            "only by chance, so that `prove` can prove nothing",
             f"make the attractor longer along {name} than {math.ceil(wide)} cells, or noise "
             "narrower",
             {"axis": name, "noise": wide, "attractor": run},
