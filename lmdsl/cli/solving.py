@@ -208,6 +208,8 @@ def _improved(steps: int | None) -> str:
 
 def _enclosed(result: Any) -> str:
     sure = f"some controller surely arrives from {result.sure_cells} cells"
+    if result.sure_cells and result.proved is None:
+        sure += " (perhaps another one than this: --proved T looks for it)"
     safe = result.claims.get("safe")
     if safe is None:
         return sure

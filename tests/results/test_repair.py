@@ -12,9 +12,10 @@ from saved_results import put, refused
 
 import lmdsl as lm
 from lmdsl.cli import main
+from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import proving
 from lmdsl.results.directory import reading
-from lmdsl.results.directory.rounds import NONE, Rounds
+from lmdsl.results.directory.rounds import LAST, NONE, SOON, Rounds
 
 pytestmark = pytest.mark.long  # in other versions it would find nothing else
 
@@ -164,6 +165,27 @@ def test_the_law_of_sure_arrival_is_the_last_resort(monkeypatch):
     assert found.proved.reached
     assert found.sure_cells == 3
     assert found.control_index[3] == 1
+
+
+@pytest.mark.parametrize(("limit", "part"), [(60, SOON), (None, LAST)])
+def test_other_laws_leave_time_for_that_of_sure_arrival(limit, part, monkeypatch):
+    seen, best = [], Rounds.best
+    monkeypatch.setattr(Rounds, "best", lambda self: (seen.append(self.part), best(self))[1])
+    lm.solve(made(line("0.9*x - 0.21", successors="enclosed")), proved=0.9, time_limit=limit)
+    lm.solve(made(line("x - 0.25")), proved=0.9, time_limit=limit)
+    assert seen == [part, LAST]
+
+
+def test_that_the_time_ran_out_is_said():
+    first, deadline = lm.solve(made(line(LOSES))), Deadline(60.0)
+
+    def again(_):
+        deadline.cancel()
+        return replace(first, lp=None)
+
+    rounds = Rounds(first, again, 0.999, deadline, None)
+    assert rounds.solved(np.array([[3, 0]]), None) is None
+    assert rounds.why == "the time ran out while it was solved without more pairs"
 
 
 def test_a_model_without_pairs_is_that_of_a_problem_without_them():

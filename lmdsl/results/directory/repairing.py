@@ -12,14 +12,14 @@ import numpy as np
 from lmdsl.common import inputs
 from lmdsl.common.types import Progress
 from lmdsl.errors import BadInput, shown
-from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.grid.boxes import named
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.successors.left_out.dropping import list_sha256
 from lmdsl.model.successors.left_out.staying import Staying
 from lmdsl.problem.problem import Problem
 from lmdsl.proof.search import LOST, STAYS, UNDECIDED
-from lmdsl.results.directory.rounds import Again, Round, Rounds, volume
+from lmdsl.results.directory.rounds import LAST, SOON, Again, Round, Rounds, volume
 from lmdsl.results.result import Result
 from lmdsl.results.summary import Proved
 from lmdsl.systems import MatrixSystem
@@ -48,10 +48,20 @@ def repaired(
         cells = first.stabilizable_cells or 0
         return replace(first, proved=Proved(target, 0.0, 0, cells, first.lower_bound))
     rounds = Rounds(first, again, target, deadline, progress)
+    rounds.part = SOON if deadline.left is not None and _sure_enough(rounds) else LAST
     best = rounds.best()
+    rounds.part = LAST
     if best.arrives < target and first.lp.sure_levels is not None:
         best = _surely(rounds, best)
     return _answer(rounds, best)
+
+
+def _sure_enough(rounds: Rounds) -> bool:
+    """Return whether the cells that surely arrive are as many as are asked for."""
+    lp = rounds.lp
+    if lp.sure_levels is None:
+        return False
+    return int((lp.sure_levels[lp.cells] > 0).sum()) >= rounds.target * lp.n
 
 
 def _surely(rounds: Rounds, best: Round) -> Round:
@@ -59,7 +69,11 @@ def _surely(rounds: Rounds, best: Round) -> Round:
     lp = rounds.lp
     if rounds.deadline():
         return best
-    keep = Staying.of(lp, rounds.deadline).surely()
+    try:
+        keep = Staying.of(lp, rounds.deadline).surely()
+    except TimeLimitReached:
+        rounds.why = "the time ran out while the law of sure arrival was looked for"
+        return best
     if not keep.any() or len(np.unique(lp.cell[keep])) <= best.arrives * lp.n:
         return best
     cell, control = lp.cells[lp.cell[~keep]], lp.control[~keep]

@@ -35,6 +35,7 @@ MOMENT, PART = 30.0, 0.2
 EARLY = 0.35  # part of the time that is kept for a proof: then nothing more is dropped before it
 SOLVED = 10  # most models of a round
 LAST = 0.85  # part of the time that is left which a proof may take
+SOON = 0.25  # the same where another law, that of sure arrival, waits for its turn
 WORST = 0.5  # share of the largest undecided volume of a cell that is as bad
 
 
@@ -75,6 +76,8 @@ class Rounds:
         What can be kept without a loss; None where that is not known.
     why
         Why the search ended.
+    part
+        Part of the time that is left which a proof may take.
     """
 
     def __init__(
@@ -85,7 +88,7 @@ class Rounds:
         self.first, self.again, self.target = first, again, target
         self.deadline, self.progress = deadline, progress
         self.lp: StabilizationLP = first.lp
-        self.why = "no other control helps"
+        self.why, self.part = "no other control helps", LAST
         self.late = 0.0 if deadline.left is None else EARLY * deadline.left
         self.lossless = Lossless.of(self.lp, deadline, progress)
 
@@ -136,7 +139,11 @@ class Rounds:
             given = 0 if self.lp.dropped is None else len(self.lp.dropped)
             result = self.first if len(dropped) == given else self.again(dropped)
             if not result.verified or result.lp is None:
-                self.why = f"without more pairs the problem is {result.status}"
+                self.why = (
+                    "the time ran out while it was solved without more pairs"
+                    if self.deadline()
+                    else f"without more pairs the problem is {result.status}"
+                )
                 return None
             if result.lp.n < least * self.lp.n:
                 self.why = f"without more pairs C has {result.lp.n} of {self.lp.n} cells"
@@ -182,7 +189,7 @@ class Rounds:
             return ended
 
         wanted = min(1.0, max(self.target / part, TARGET))  # less would leave losses undecided
-        limit = None if left is None else LAST * left
+        limit = None if left is None else self.part * left
         proof = prove(result, wanted, limit, self.progress, ending=at_fault)
         return Round(result, proof, proof.arrives * part, not ended)
 
