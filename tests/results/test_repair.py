@@ -15,7 +15,8 @@ from lmdsl.cli import main
 from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import proving
 from lmdsl.results.directory import reading
-from lmdsl.results.directory.rounds import LAST, NONE, SOON, Rounds
+from lmdsl.results.directory.repairing import _advice
+from lmdsl.results.directory.rounds import LAST, NONE, SOON, Round, Rounds
 
 pytestmark = pytest.mark.long  # in other versions it would find nothing else
 
@@ -186,6 +187,14 @@ def test_that_the_time_ran_out_is_said():
     rounds = Rounds(first, again, 0.999, deadline, None)
     assert rounds.solved(np.array([[3, 0]]), None) is None
     assert rounds.why == "the time ran out while it was solved without more pairs"
+
+
+def test_a_proof_that_the_limit_ended_is_said_to_be_the_reason(repaired):
+    rounds = Rounds(repaired, lambda _: repaired, 1.0, Deadline(), None)
+    for stopped, why in ((True, "the time limit ended the proof"), (False, rounds.why)):
+        proof = replace(repaired.proof, stopped=stopped)
+        told = _advice(rounds, Round(repaired, proof, proof.arrives, True))
+        assert told.startswith(why)
 
 
 def test_a_model_without_pairs_is_that_of_a_problem_without_them():

@@ -135,7 +135,8 @@ def _advice(rounds: Rounds, best: Round) -> str:
     worst = int(np.argmax(missing))
     index = int(result.control_index[worst])
     u = ", ".join(f"{x:.6g}" for x in result.control_vectors[index])
+    why = "the time limit ended the proof" if proof.stopped else rounds.why
     return (
-        f"{rounds.why}; most is missing in {named(partition, worst)} under control {index} ({u}); "
+        f"{why}; most is missing in {named(partition, worst)} under control {index} ({u}); "
         "more time, smaller cells or a finer control_grid would help"
     )
