@@ -5,7 +5,7 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from lmdsl.cli.output import (
     Arguments,
@@ -19,6 +19,9 @@ from lmdsl.cli.output import (
 from lmdsl.cli.streams import say, tell
 from lmdsl.errors import LmdslError, plain_text, printable
 from lmdsl.results.status import Status
+
+if TYPE_CHECKING:
+    from lmdsl.results.summary import Coverage
 
 OPTIONS = (
     "tolerance",
@@ -193,9 +196,9 @@ def _summary(result: Any) -> str:
     return "\n".join([*_first(result.coverage), *lines, "", printable(result.message)])
 
 
-def _first(found: Any) -> list[str]:
+def _first(found: "Coverage | None") -> list[str]:
     """Return what is said before all else: that little can be stabilized, where that is so."""
-    if not 0 < found.stabilizable < LITTLE * found.free:
+    if found is None or not 0 < found.stabilizable < LITTLE * found.free:
         return []
     return [f"only {found.stabilizable} of {found.free} free cells can be stabilized", ""]
 

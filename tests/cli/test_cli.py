@@ -121,6 +121,22 @@ def test_exit_statuses(capsys, file, tmp_path):
     assert lm.Result.load(tmp_path / "u").simulate(starts=100).reached > 0
 
 
+@pytest.mark.parametrize("json_too", [False, True])
+@pytest.mark.parametrize(
+    "command",
+    [["solve"], ["solve", "--proved", "0.9"], ["compare", "--backends", "policy-iteration,highs"]],
+)
+def test_no_time_at_all_is_said(capsys, file, command, json_too):
+    name, *options = command
+    more = ["--json"] if json_too else []
+    status, out, err = run(
+        capsys, name, file(standard_map(20)), *options, "--time-limit", "1e-9", *more
+    )
+    assert status in (1, 4)
+    assert "internal error" not in out + err
+    assert "time" in out + err
+
+
 def test_function_results_keep_their_rows(tmp_path, capsys):
     from problems import made
 
