@@ -244,7 +244,7 @@ def test_exit_status_and_output(tmp_path, result, capsys):
     said = json.loads(capsys.readouterr().out)
     assert [*said] == ["arrives", "lost", "stays", "undecided", "steps", "cost", "boxes",
                        "seconds", "holds", "witnesses", "followed", "optimum",
-                       "nonnegative", "parts", "probability", "where"]  # fmt: skip
+                       "nonnegative", "parts", "probability", "where", "stopped"]  # fmt: skip
     assert main(["prove", str(tmp_path / "nowhere")]) == 2
     assert main(["prove", str(tmp_path / "out"), "--target", "7"]) == 2
     assert main(["prove", str(tmp_path / "out"), "--target", "0.5"]) == 0
