@@ -42,6 +42,7 @@ PAGES = [
 ]
 LOOSE = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 page = pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+SLOW = {"tutorial.md", "command-line.md"}  # pages whose blocks are not run in other versions
 
 
 def same(got: str, wanted: str) -> bool:
@@ -76,7 +77,13 @@ def commands(text: str) -> list[tuple[str, str, int]]:
 # Blocks ---------------------------------------------------------------------------------------
 
 
-@page
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=path.name, marks=[pytest.mark.long] if path.name in SLOW else [])
+        for path in PAGES
+    ],
+)
 def test_blocks_run(path, tmp_path, monkeypatch):
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     monkeypatch.chdir(tmp_path)

@@ -11,6 +11,8 @@ from agreement import compare
 
 from benchmarks import zoo
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 FEW = {
     "tent_map": [15],
     "circle_map": [20],
