@@ -33,7 +33,6 @@ OPTIONS = (
 )
 # Runs of the true map that follow a solve: how many, how long, and how long all together.
 STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
-LITTLE = 0.1  # share of cells that can be stabilized below which that is said first
 
 
 def add(command: Command) -> None:
@@ -198,6 +197,8 @@ def _summary(result: Any) -> str:
 
 def _first(found: "Coverage | None") -> list[str]:
     """Return what is said before all else: that little can be stabilized, where that is so."""
+    from lmdsl.results.job import LITTLE
+
     if found is None or not 0 < found.stabilizable < LITTLE * found.free:
         return []
     return [f"only {found.stabilizable} of {found.free} free cells can be stabilized", ""]
