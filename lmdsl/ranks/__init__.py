@@ -1,0 +1,1 @@
+"""Which process owns which cells, and how they talk: alone, as threads, under MPI."""

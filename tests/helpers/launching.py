@@ -1,0 +1,32 @@
+"""Programs of several processes, where mpi4py and a launcher are installed."""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+LAUNCHER = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
+
+needs_mpi = pytest.mark.skipif(
+    LAUNCHER is None or importlib.util.find_spec("mpi4py") is None, reason="needs mpi4py and an MPI"
+)
+
+
+def launch(count, program, *arguments):
+    """Run a program of ``rank_programs`` on so many processes; return how it ended."""
+    script = Path(__file__).with_name("rank_programs.py")
+    command = [LAUNCHER, "-n", str(count), sys.executable, str(script), program, *arguments]
+    env = {**os.environ, "NUMBA_NUM_THREADS": "1"}
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=env)
+
+
+def returned(count, program, *arguments):
+    """Return what every rank of a program returned."""
+    done = launch(count, program, *arguments)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)

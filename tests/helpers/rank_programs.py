@@ -1,0 +1,108 @@
+"""Programs for ranks, and what runs one under MPI: ``mpiexec -n R python rank_programs.py NAME``.
+
+Each returns plain data that is to be the same however it is run; rank 0 prints what all returned.
+"""
+
+import json
+import sys
+import time
+
+import numpy as np
+
+from lmdsl.errors import BadInput
+from lmdsl.ranks.ending import together
+from lmdsl.ranks.mpi import at_hand
+
+
+def verbs(ranks):
+    """Every verb, of data that depend on the ranks in a way that can be told beforehand."""
+    me, count = ranks.rank, ranks.count
+    to = {k: np.arange(10 * me + k, 10 * me + k + me + 1) for k in range(count) if (me + k) % 3}
+    came = ranks.exchange(to)
+    sizes = {k: k + 1 for k in came}
+    again = ranks.exchange(to, sizes, np.int64)
+    assert [*again] == [*came]
+    assert all((again[k] == came[k]).all() for k in came)
+    own = np.full(me + 1, float(me))
+    whole = ranks.gathered(own)
+    parts = None if me else [np.full(k + 1, k, dtype=np.uint8) for k in range(count)]
+    return {
+        "came": {str(k): array.tolist() for k, array in came.items()},
+        "collected": ranks.collect({"rank": me}),
+        "gathered": None if whole is None else whole.tolist(),
+        "listed": ranks.gather(me),
+        "scattered": ranks.scatter(parts).tolist(),
+        "shared": ranks.share(None if me else "of rank 0"),
+        "any": ranks.any(me == 1),
+        "all": ranks.all(me < 3),
+        "agreed": ranks.agreed(lambda: me * me),
+    }
+
+
+def sums(ranks):
+    """A sum of twelve parts that depends on their order: to be the same for every count."""
+    parts = [1e16, 1.0, -1e16, 3.0, 1e-3, 7e15, -1.0, 0.1, -7e15, 0.2, 0.3, 1.0]
+    bounds = [12 * k // ranks.count for k in range(ranks.count + 1)]
+    own = parts[bounds[ranks.rank] : bounds[ranks.rank + 1]]
+    return ranks.reduce(own, lambda a, b: a + b, 0.0).hex()
+
+
+def agreed_error(ranks):
+    """An error of the last ranks: that of the lowest of them is everybody's."""
+
+    def work():
+        if ranks.rank >= ranks.count // 2:
+            raise BadInput(f"the cost of rank {ranks.rank} is nan", "stage_cost")
+
+    try:
+        ranks.agreed(work)
+    except BadInput as error:
+        return [type(error).__name__, str(error), error.where, error.agreed]
+    return None
+
+
+def lonely_error(ranks):
+    """An error that one rank meets while the others wait for it."""
+    if ranks.rank == ranks.count - 1:
+        raise ValueError("met by the last rank")
+    return ranks.collect(1)
+
+
+def lonely_memory(ranks):
+    """The same, an error that is no Exception of ours."""
+    if ranks.rank == ranks.count - 1:
+        raise KeyboardInterrupt
+    return ranks.any(False)
+
+
+def deadline(ranks):
+    """One rank's time is up after a while: all stop in the same round."""
+    until = time.monotonic() + (0.05 if ranks.rank == ranks.count - 1 else 1e9)
+    time_up, rounds = ranks.time_up(lambda: time.monotonic() > until), 0
+    while not time_up():
+        rounds += 1
+    return rounds == ranks.collect(rounds)[0] and rounds > 0
+
+
+def out_of_step(ranks):
+    """One rank says a verb more than the others."""
+    if ranks.rank == 0:
+        ranks.traffic.calls += 1
+    return ranks.collect(1)
+
+
+PROGRAMS = {
+    f.__name__: f
+    for f in (verbs, sums, agreed_error, lonely_error, lonely_memory, deadline, out_of_step)
+}
+
+
+def main():
+    ranks = at_hand()
+    found = together(ranks, lambda ranks: ranks.collect(PROGRAMS[sys.argv[1]](ranks)))
+    if ranks.rank == 0:
+        print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
