@@ -3,6 +3,7 @@
 Each returns plain data that is to be the same however it is run; rank 0 prints what all returned.
 """
 
+import itertools
 import json
 import sys
 import time
@@ -11,7 +12,9 @@ import numpy as np
 
 from lmdsl.errors import BadInput
 from lmdsl.ranks.ending import together
+from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.mpi import at_hand
+from lmdsl.ranks.ranges import Division
 
 
 def verbs(ranks):
@@ -91,9 +94,59 @@ def out_of_step(ranks):
     return ranks.collect(1)
 
 
+def graph(seed=0, cells=101):
+    """Rows of a model of a few cells: entries by cell, targets (the last: attractor), shares."""
+    random = np.random.default_rng(seed)
+    length = random.integers(0, 6, cells)
+    pointer = np.concatenate([[0], np.cumsum(length)])
+    far = random.integers(0, cells + 1, pointer[-1])
+    near = np.clip(np.repeat(np.arange(cells), length) + random.integers(-3, 4, len(far)), 0, cells)
+    target = np.where(random.random(len(far)) < 0.8, near, far)
+    return pointer, target, random.random(len(far)), length
+
+
+def own_rows(ranks, seed=0, cells=101):
+    """The mesh of a rank, and its rows in local numbers."""
+    pointer, target, share, length = graph(seed, cells)
+    division = Division.cut(length, ranks.count)
+    first, last = division.own(ranks.rank)
+    own = slice(pointer[first], pointer[last])
+    mesh = Mesh.of(ranks, division, target[own])
+    return mesh, pointer[first : last + 1] - pointer[first], mesh.local(target[own]), share[own]
+
+
+def products(pointer, target, share, x):
+    """The sum over every row, entry by entry."""
+    return [
+        sum((share[e] * x[target[e]] for e in range(a, b)), 0.0)
+        for a, b in itertools.pairwise(pointer)
+    ]
+
+
+def rows_times_values(ranks):
+    """P x of three x one after the other, as rank 0 collects it, to the bit."""
+    mesh, pointer, target, share = own_rows(ranks)
+    first, last = mesh.division.own(ranks.rank)
+    found = []
+    for seed in range(3):
+        values = np.random.default_rng(seed).random(mesh.division.cells)[first:last]
+        own = np.array(products(pointer, target, share, mesh.spread(values)))
+        found.append(np.concatenate(ranks.collect(own)).tobytes().hex())
+    return found
+
+
 PROGRAMS = {
     f.__name__: f
-    for f in (verbs, sums, agreed_error, lonely_error, lonely_memory, deadline, out_of_step)
+    for f in (
+        verbs,
+        sums,
+        agreed_error,
+        lonely_error,
+        lonely_memory,
+        deadline,
+        out_of_step,
+        rows_times_values,
+    )
 }
 
 

@@ -1,0 +1,221 @@
+"""Own cells and ghosts of a rank: local numbers, and who sends what to whom.
+
+A rank numbers the cells that its rows name: first its own in order, then its *ghosts*, the cells of
+other ranks, ascending, then the attractor. Rows that are numbered so keep the order of their
+entries, so that every sum over a row is the same to the bit as in one process. Vectors for such
+rows have the values of own cells, ghosts and the attractor, as :meth:`Mesh.spread` makes them.
+
+The certificate does not see a wrong ghost: claims about wrong numbers hold too. So:
+
+1. when a plan is made, every ghost confirms its number with its owner by the very messages that
+   carry values afterwards: a ghost that is swapped, missing or one too many is refused;
+2. every message bears the plan it belongs to and its place in the series: old values are refused;
+3. of ghosts that a plan leaves out the value is NaN, and a plan is asked whether it covers rows;
+4. an owner is asked for its own cells only, and all ranks agree beforehand on what is whose.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Indices
+from lmdsl.ranks.ranges import Division
+from lmdsl.ranks.verbs import RankError, Ranks
+
+Slots = NDArray[np.int64]
+
+
+@dataclass(eq=False)
+class Halo:
+    """A plan: the values of which own cells go to whom, and which ghosts those that come are.
+
+    Attributes
+    ----------
+    ranks, number
+        Whose plan it is, and a number that it has on every rank.
+    send
+        Own cells (local numbers) whose values go to a rank, by rank.
+    slots
+        Ghosts (local numbers) whose values come from a rank, by rank.
+    spread
+        How often values were sent by it.
+    """
+
+    ranks: Ranks
+    number: int
+    send: dict[int, Slots]
+    slots: dict[int, Slots]
+    spreads: int = 0
+
+    def fill(self, x: NDArray[Any]) -> None:
+        """Write the values of other ranks' cells into the ghosts of x; collective.
+
+        Every message ends with the plan and how often it was used, in bytes of the same kind.
+        """
+        self.spreads += 1
+        stamp = _stamp(self.number, self.spreads, x.dtype)
+        parcels = {to: np.concatenate([x[cells], stamp]) for to, cells in self.send.items()}
+        sizes = {of: len(slots) + len(stamp) for of, slots in self.slots.items()}
+        for of, came in self.ranks.exchange(parcels, sizes, x.dtype).items():
+            end = len(self.slots[of])
+            if came[end:].tobytes() != stamp.tobytes():
+                raise RankError(
+                    f"rank {of} sent rank {self.ranks.rank} values of another time or plan"
+                )
+            x[self.slots[of]] = came[:end]
+
+    @property
+    def size(self) -> int:
+        """Number of ghosts that it fills."""
+        return sum(map(len, self.slots.values()))
+
+
+@dataclass(eq=False)
+class Mesh:
+    """The cells of a rank in local numbers.
+
+    Attributes
+    ----------
+    ranks, division
+        Who talks, and which cells are whose, by global numbers.
+    ghosts
+        Global numbers of the ghosts, ascending, shape (ghosts,).
+    halo
+        The plan of all ghosts.
+    """
+
+    ranks: Ranks
+    division: Division
+    ghosts: Indices
+    halo: Halo = field(init=False)
+    plans: int = 0
+
+    @classmethod
+    def of(cls, ranks: Ranks, division: Division, named: NDArray[np.integer]) -> "Mesh":
+        """Return the mesh of rows that name these cells, by global numbers; collective.
+
+        Numbers of own cells, and of the attractor (``division.cells``), are passed over.
+        """
+        division.confirm(ranks)
+        first, last = division.own(ranks.rank)
+        cells = np.unique(np.asarray(named, dtype=np.int64))
+        ghosts = cells[((cells < first) | (cells >= last)) & (cells < division.cells)]
+        wrong = len(ghosts) and ghosts[0] < 0
+        if ranks.any(bool(wrong)):
+            raise RankError(f"rows of a rank name cells outside 0..{division.cells - 1}")
+        mesh = cls(ranks, division, ghosts)
+        mesh.halo = mesh.plan(np.arange(len(ghosts)))
+        return mesh
+
+    @property
+    def own(self) -> int:
+        """Number of own cells."""
+        first, last = self.division.own(self.ranks.rank)
+        return last - first
+
+    @property
+    def columns(self) -> int:
+        """Number of own cells and ghosts: the local number of the attractor."""
+        return self.own + len(self.ghosts)
+
+    @property
+    def numbers(self) -> Indices:
+        """Global numbers of own cells, ghosts and the attractor, by local number."""
+        own = np.arange(*self.division.own(self.ranks.rank), dtype=np.int64)
+        return np.concatenate([own, self.ghosts, [self.division.cells]])
+
+    def local(self, cells: NDArray[np.integer]) -> NDArray[np.int32]:
+        """Return the local numbers of cells given by global ones; each is looked up and back."""
+        first, last = self.division.own(self.ranks.rank)
+        cells = np.asarray(cells, dtype=np.int64)
+        found = np.searchsorted(self.ghosts, cells) + (last - first)
+        inside = (cells >= first) & (cells < last)
+        found = np.where(inside, cells - first, found)
+        found = np.where(cells == self.division.cells, self.columns, found)
+        if not (self.numbers[np.minimum(found, self.columns)] == cells).all():
+            raise RankError(f"rank {self.ranks.rank} has no ghost for a cell that its rows name")
+        return found.astype(np.int32)
+
+    def plan(self, chosen: NDArray[np.integer]) -> Halo:
+        """Return the plan of some ghosts, by their places among all, and confirm it; collective.
+
+        The owner of every ghost is asked for it by its global number, and answers for its own.
+        """
+        self.plans += 1
+        chosen = np.unique(np.asarray(chosen, dtype=np.int64))
+        wanted, slots = self.ghosts[chosen], chosen + self.own
+        owner = self.division.owner(wanted)
+        asked = {int(k): wanted[owner == k] for k in np.unique(owner)}
+        first, last = self.division.own(self.ranks.rank)
+        send: dict[int, Slots] = {}
+        for other, cells in self.ranks.exchange(asked).items():
+            if len(cells) and not (first <= cells.min() and cells.max() < last):
+                raise RankError(
+                    f"rank {other} asks rank {self.ranks.rank}, which has the cells {first} to "
+                    f"{last - 1}, for others"
+                )
+            send[other] = cells - first
+        halo = Halo(self.ranks, self.plans, send, {k: slots[owner == k] for k in asked})
+        self.confirm(halo, slots)
+        return halo
+
+    def confirm(self, halo: Halo, slots: NDArray[np.integer]) -> None:
+        """Refuse a plan by which some ghost does not get the number of its own cell; collective."""
+        numbers = self.numbers
+        told = numbers.copy()
+        told[self.own : -1] = -1
+        halo.fill(told)
+        wrong = np.flatnonzero(told[slots] != numbers[slots])
+        if len(wrong):
+            k = int(slots[wrong[0]])
+            raise RankError(
+                f"rank {self.ranks.rank} waits for cell {numbers[k]} and gets "
+                f"{told[k] if told[k] >= 0 else 'nothing'}"
+            )
+        self.ranks.collect(None)  # nobody goes on before all are sure
+
+    def for_rows(self, targets: NDArray[np.integer]) -> Halo:
+        """Return the plan of the ghosts that some rows name, by local numbers; collective."""
+        named = np.unique(np.asarray(targets, dtype=np.int64)) - self.own
+        return self.plan(named[(named >= 0) & (named < len(self.ghosts))])
+
+    def require_covered(self, halo: Halo, targets: NDArray[np.integer]) -> None:
+        """Refuse a plan that leaves out a ghost that rows name, by local numbers."""
+        known = np.ones(self.columns + 1, dtype=np.bool_)
+        known[self.own : -1] = False
+        for slots in halo.slots.values():
+            known[slots] = True
+        bad = np.flatnonzero(~known[targets])
+        if len(bad):
+            cell = self.numbers[targets[bad[0]]]
+            raise RankError(f"rank {self.ranks.rank} reads cell {cell}, which nobody sends")
+
+    def spread(
+        self, own: NDArray[Any], attractor: Any = 0.0, halo: Halo | None = None
+    ) -> NDArray[Any]:
+        """Return own values, those of the ghosts and the attractor's; collective.
+
+        Ghosts that ``halo`` leaves out are NaN; of whole numbers every bit is set.
+        """
+        x = np.empty(self.columns + 1, dtype=own.dtype)
+        x[: self.own], x[self.columns] = own, attractor
+        x[self.own : self.columns] = _nothing(own.dtype)
+        (halo or self.halo).fill(x)
+        return x
+
+
+def _nothing(kind: np.dtype[Any]) -> Any:
+    """Return what stands for no value."""
+    if kind.kind == "u":
+        return np.iinfo(kind).max
+    return np.nan if kind.kind == "f" else -1
+
+
+def _stamp(plan: int, spread: int, kind: np.dtype[Any]) -> NDArray[Any]:
+    """Return eight bytes that tell a plan and its use, as numbers of a kind."""
+    word = np.array([plan << 40 | spread], dtype=np.uint64)
+    if kind == np.bool_:  # whose bytes are 0 or 1
+        return np.unpackbits(word.view(np.uint8)).view(np.bool_)
+    return word.view(kind)
