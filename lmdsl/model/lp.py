@@ -36,6 +36,7 @@ from lmdsl.model.successors.left_out.dropping import left_out
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem import Problem, given
 from lmdsl.problem.whole.changing import with_gamma_alone
+from lmdsl.ranks.mesh import Mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +67,8 @@ class StabilizationLP(Frozen):
         See :meth:`Successors.sure_levels`; None where successors are not enclosed.
     hold
         Control index of the attractor cells that hold, else -1, shape (N,); None if not asked for.
-    dropped
-        Pairs (cell, control) that were left out, in order, shape (D, 2); None where there is none.
+    dropped, mesh
+        Pairs (cell, control) left out, in order, (D, 2); own cells and ghosts of a rank. Else None.
     """
 
     problem: Problem
@@ -84,6 +85,7 @@ class StabilizationLP(Frozen):
     sure_levels: NDArray[np.int32] | None = None
     hold: holding.Controls | None = None
     dropped: NDArray[np.int64] | None = None
+    mesh: Mesh | None = None
     _known: InitVar[algorithm_1.Levels | None] = None
     _levels: ClassVar[algorithm_1.Levels | None] = None
 
@@ -165,11 +167,10 @@ class StabilizationLP(Frozen):
         own, reached = renumber[self.cell[columns]], renumber[taken.target]
         if len(own) and min(own.min(), reached.min(initial=0)) < 0:
             raise BadInput("a column belongs or leads to a cell that is left out", "inside")
-        count = np.bincount(own, minlength=len(inside))
         return replace(
             self,
             cells=self.cells[inside],
-            pair_pointer=np.concatenate([[0], np.cumsum(count)]).astype(np.int64),
+            pair_pointer=np.append(0, np.cumsum(np.bincount(own, minlength=len(inside)))),
             control=self.control[columns],
             rows=replace(taken, target=reached, columns=len(inside)),
             cost=self.cost[columns],

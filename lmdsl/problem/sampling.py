@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import threading
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -15,6 +16,8 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.problem.unions import kinds
 
 MOST_AXES = 8  # with corners: 256 of them
+
+_filtering = threading.Lock()  # filters of warnings are the process's, not a thread's
 
 PerAxis = Annotated[
     Annotated[Count, Tag("<one>")]
@@ -132,7 +135,7 @@ class Sobol(_Points):
     def _points(self, states: Sequence[str]) -> Floats:
         from scipy.stats import qmc
 
-        with warnings.catch_warnings():
+        with _filtering, warnings.catch_warnings():
             # Balance wants a power of two; any number of points is a valid sample.
             warnings.simplefilter("ignore", UserWarning)
             drawn = qmc.Sobol(len(states), scramble=True, seed=self.seed)

@@ -24,7 +24,7 @@ from lmdsl.common.types import Indices
 from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.verbs import RankError, Ranks
 
-Slots = NDArray[np.int64]
+LocalNumbers = NDArray[np.int64]
 
 
 @dataclass(eq=False)
@@ -45,8 +45,8 @@ class Halo:
 
     ranks: Ranks
     number: int
-    send: dict[int, Slots]
-    slots: dict[int, Slots]
+    send: dict[int, LocalNumbers]
+    slots: dict[int, LocalNumbers]
     spreads: int = 0
 
     def fill(self, x: NDArray[Any]) -> None:
@@ -149,7 +149,7 @@ class Mesh:
         owner = self.division.owner(wanted)
         asked = {int(k): wanted[owner == k] for k in np.unique(owner)}
         first, last = self.division.own(self.ranks.rank)
-        send: dict[int, Slots] = {}
+        send: dict[int, LocalNumbers] = {}
         for other, cells in self.ranks.exchange(asked).items():
             if len(cells) and not (first <= cells.min() and cells.max() < last):
                 raise RankError(

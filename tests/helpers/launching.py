@@ -17,16 +17,17 @@ needs_mpi = pytest.mark.skipif(
 )
 
 
-def launch(count, program, *arguments):
-    """Run a program of ``rank_programs`` on so many processes; return how it ended."""
-    script = Path(__file__).with_name("rank_programs.py")
+def launch(count, program, *arguments, script="rank_programs.py"):
+    """Run a program of a script on so many processes; return how it ended."""
+    script = Path(__file__).with_name(script)
     command = [LAUNCHER, "-n", str(count), sys.executable, str(script), program, *arguments]
-    env = {**os.environ, "NUMBA_NUM_THREADS": "1"}
+    path = os.pathsep.join((str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")))
+    env = {**os.environ, "NUMBA_NUM_THREADS": "1", "PYTHONPATH": path}
     return subprocess.run(command, capture_output=True, text=True, timeout=60, env=env)
 
 
-def returned(count, program, *arguments):
+def returned(count, program, *arguments, script="rank_programs.py"):
     """Return what every rank of a program returned."""
-    done = launch(count, program, *arguments)
+    done = launch(count, program, *arguments, script=script)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)

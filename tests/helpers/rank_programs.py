@@ -150,9 +150,9 @@ PROGRAMS = {
 }
 
 
-def main():
-    ranks = at_hand()
-    found = together(ranks, lambda ranks: ranks.collect(PROGRAMS[sys.argv[1]](ranks)))
+def main(programs=PROGRAMS):
+    ranks, (name, *arguments) = at_hand(), sys.argv[1:]
+    found = together(ranks, lambda ranks: ranks.collect(programs[name](ranks, *arguments)))
     if ranks.rank == 0:
         print(json.dumps(found))
 

@@ -21,8 +21,8 @@ PACKAGE = Path(lm.__file__).parent
 # Data flows one way: a package imports only from packages before it, inside functions too.
 PACKAGES = [
     "errors", "machine", "common", "ranks", "formulas", "systems", "problem", "model",
-    "certificate", "optimize", "backends", "data", "proof", "control", "results", "explanation",
-    "advice", "plotting", "report", "interop", "testing", "cli", "__main__",
+    "certificate", "optimize", "slabs", "backends", "data", "proof", "control", "results",
+    "explanation", "advice", "plotting", "report", "interop", "testing", "cli", "__main__",
 ]  # fmt: skip
 
 # Imports against the order, inside functions: methods that only forward to a later package.

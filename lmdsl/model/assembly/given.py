@@ -59,6 +59,20 @@ def of_matrices(problem: Problem, partition: Partition, sets: CellSets) -> Trans
     )
 
 
+def cut(every: Transitions, span: tuple[int, int] | None) -> Transitions:
+    """Return the pairs of some free cells."""
+    if span is None or span == (0, len(every.sets.free)):
+        return every
+    a, b = (int(every.pair_pointer[k]) for k in span)
+    return Transitions(
+        sets=every.sets,
+        pair_pointer=every.pair_pointer[span[0] : span[1] + 1] - a,
+        control=every.control[a:b],
+        rows=every.rows.take(np.arange(a, b)),
+        cost=every.cost[a:b],
+    )
+
+
 def shares_of_matrices(problem: Problem, given: GivenRows) -> Shares:
     """Return what the codes of a finite model stand for."""
     shares = Shares(given.numerator, None, given.values(), True, given.denominator)

@@ -61,11 +61,14 @@ def assemble(
     deadline: Deadline | None = None,
     sets: CellSets | None = None,
     way: CellSets | None = None,
+    span: tuple[int, int] | None = None,
 ) -> Transitions:
     """Build the rows of every admissible pair.
 
     ``sets`` are the problem's, where they are known, and ``way`` those that judge what steps meet
-    on their way, and what they pay at its end, where these are others.
+    on their way, and what they pay at its end, where these are others. ``span`` are the first free
+    cell whose pairs are asked for, and the one after the last, by their positions; default all.
+    They are the same rows as among all: blocks of cells do not depend on what is asked for.
 
     TimeLimitReached: the deadline has passed, and it was more than a moment's work. BadInput: the
     problem does not fit in memory, or the stage cost of an admissible pair is negative or not
@@ -75,14 +78,15 @@ def assemble(
     deadline = unless_short(problem, Deadline.of(deadline))
     sets = sets or CellSets.of(problem, partition, deadline)
     if isinstance(problem.system, MatrixSystem):
-        from lmdsl.model.assembly.given import of_matrices  # which makes what stands here
+        from lmdsl.model.assembly.given import cut, of_matrices  # which make what stands here
 
-        return of_matrices(problem, partition, sets)
+        return cut(of_matrices(problem, partition, sets), span)
     sampler = Sampler(problem, partition, deadline, sets=way or sets)
     try:
         with sampler.asked.helped():
             sampler.audit(sets.free)
-            return _assembled(problem, sets, sampler, progress, deadline)
+            asked = (0, len(sets.free)) if span is None else span
+            return _assembled(problem, sets, sampler, progress, deadline, asked)
     except BaseException:
         deadline.cancel()  # threads that help may be far from the end of their blocks
         raise
@@ -94,11 +98,12 @@ def _assembled(
     sampler: Sampler,
     progress: Progress | None,
     deadline: Deadline,
+    span: tuple[int, int],
 ) -> Transitions:
     pilot = _pilot(sampler, sets)
-    need = estimate(problem, pilot)
+    F, M = span[1] - span[0], len(sampler.controls)
+    need = estimate(problem, pilot) * F // max(len(sets.free), 1)
     memory.require(need, named(problem, "estimated from a few cells"))
-    F, M = len(sets.free), len(sampler.controls)
     guard = partial(deadline.raise_if_over, "compiling")
     shares = shares_of(problem, len(sampler.points), sampler.nodes, guard)
     pairs = int(F * M * min(1.0, 1.05 * pilot.admissible)) + M
@@ -113,15 +118,17 @@ def _assembled(
     # glibc returns the memory of a block to the system, to fault it in again for the next one,
     # unless it has seen more than that freed at once.
     np.empty(2**20)
-    assembler, parts = Assembler(sampler, sets, shares), sampler.blocks(sets.free)
-    for block, rows in sampler.asked.in_order(assembler, parts, deadline.cancel):
-        pair_pointer[1 + block.first : 1 + block.first + len(block.cells)] += rows.per_cell
+    assembler = Assembler(sampler, sets, shares)
+    parts = (part for part in sampler.blocks(sets.free) if _meets(part, span))
+    for block, every in sampler.asked.in_order(assembler, parts, deadline.cancel):
+        at, rows = _within(block, every, span)
+        pair_pointer[1 + at : 1 + at + len(rows.per_cell)] += rows.per_cell
         pointer.append(rows.end + target.used)
         control.append(rows.control)
         cost.append(rows.cost)
         target.append(rows.target)
         code.append(rows.code)
-        done += block.lanes
+        done += len(rows.per_cell) * block.width
         deadline.raise_if_over("compiling")
         if not sampler.asked.singles:  # which say so themselves
             outlook.done(done / (F * M))
@@ -132,9 +139,31 @@ def _assembled(
         sets=sets,
         pair_pointer=np.cumsum(pair_pointer, out=pair_pointer),
         control=control.array(),
-        rows=Rows(pointer.array(), target.array(), code.array(), shares, F),
+        rows=Rows(pointer.array(), target.array(), code.array(), shares, len(sets.free)),
         cost=cost.array(),
     )
+
+
+def _meets(block: Block, span: tuple[int, int]) -> bool:
+    return max(block.first, span[0]) < min(block.first + len(block.cells), span[1])
+
+
+def _within(block: Block, rows: BlockRows, span: tuple[int, int]) -> tuple[int, BlockRows]:
+    """Return which of the cells asked for a block begins with, and the rows of those in it.
+
+    A block is always made as a whole: what a map is to the last bit may depend on the others.
+    """
+    first, last = max(span[0] - block.first, 0), min(span[1] - block.first, len(block.cells))
+    at = block.first + first - span[0]
+    if last - first == len(block.cells):
+        return at, rows
+    a, b = int(rows.per_cell[:first].sum()), int(rows.per_cell[:last].sum())
+    start = rows.end[a - 1] if a else np.int64(0)
+    entries = slice(int(start), int(rows.end[b - 1]) if b else 0)
+    return at, BlockRows(
+        rows.per_cell[first:last], rows.control[a:b], rows.cost[a:b], rows.end[a:b] - start,
+        rows.target[entries], rows.code[entries],
+    )  # fmt: skip
 
 
 def shares_of(problem: Problem, points: int, nodes: Nodes, guard: Guard | None = None) -> Shares:

@@ -1,0 +1,122 @@
+"""A problem compiled over ranks: every rank keeps the LP of its own cells of C.
+
+What must hold: the LPs of all ranks, one after the other and in global numbers, are the one that
+:func:`lmdsl.model.lp.compile` makes, to the bit: statuses, cells, pairs, rows, costs, weights.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from lmdsl.common.types import Floats, Indices, Statuses
+from lmdsl.machine.deadline import Deadline
+from lmdsl.model.assembly.substeps import settled
+from lmdsl.model.discretization import control_vectors
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.model.rows import Rows
+from lmdsl.model.sets import CellSets
+from lmdsl.model.stabilizable_set import CellStatus, Stabilizable, _ends, _keep
+from lmdsl.problem import Problem
+from lmdsl.ranks.mesh import Mesh
+from lmdsl.ranks.verbs import Ranks
+from lmdsl.slabs import levels
+from lmdsl.slabs.pairs import OwnPairs, assembled
+
+
+def compiled(ranks: Ranks, problem: Problem, deadline: Deadline | None = None) -> StabilizationLP:
+    """Return the LP of the own cells of C; collective.
+
+    Its ``cell_status`` is that of the own free cells.
+    """
+    deadline = Deadline.of(deadline)
+    problem = ranks.agreed(lambda: settled(problem, deadline))
+    partition = ranks.agreed(lambda: Partition.of(problem))
+    pairs = assembled(ranks, problem, partition, deadline)
+    rows = pairs.rows if problem.ends_in_time else pairs.rows.without_end()
+    found = levels.stabilizable(pairs.mesh, pairs.pair_pointer, rows, deadline)
+    inside = found.inside[: pairs.mesh.own]
+    mesh, kept, own = _restricted(pairs, found)
+    first, last = pairs.mesh.division.own(ranks.rank)
+    cells = pairs.sets.free[first:last][inside]
+    level, pair = found.level[inside], found.pair[inside]
+    per_cell = np.diff(np.append(0, np.cumsum(found.surviving))[pairs.pair_pointer])[inside]
+    return StabilizationLP(
+        problem=problem,
+        partition=partition,
+        controls=control_vectors(problem),
+        cell_status=_statuses(found, pairs.pair_pointer),
+        cells=cells,
+        pair_pointer=np.append(0, np.cumsum(per_cell)).astype(np.int64),
+        control=pairs.control[kept],
+        rows=own,
+        cost=pairs.cost[kept],
+        gamma=problem.gamma,
+        weight=_weight(ranks, pairs.sets, cells),
+        mesh=mesh,
+        _known=(level, np.searchsorted(kept, pair)),
+    )
+
+
+def _restricted(pairs: OwnPairs, found: Stabilizable) -> tuple[Mesh, Indices, Rows]:
+    """Return the mesh of C, the pairs that survive, and their rows in its local numbers."""
+    before, rows = pairs.mesh, pairs.rows
+    inside = found.inside[: before.own]
+    division = before.division.within(before.ranks, inside)
+    number = np.full(before.own, -1, dtype=np.int64)
+    number[inside] = division.own(before.ranks.rank)[0] + np.arange(inside.sum())
+    numbers = before.spread(number, division.cells)
+    pointer = np.zeros(int(found.surviving.sum()) + 1, dtype=np.int64)
+    entries = _ends(found.surviving, rows.pointer, pointer)
+    target, code = np.empty(entries, dtype=np.int32), np.empty(entries, dtype=rows.code.dtype)
+    same = np.arange(before.columns + 1, dtype=np.int32)
+    _keep(found.surviving, rows.pointer, rows.target, rows.code, same, target, code)
+    mesh = Mesh.of(before.ranks, division, numbers[np.unique(target)])
+    local = np.full(before.columns + 1, -1, dtype=np.int32)
+    named = np.unique(target)
+    local[named] = mesh.local(numbers[named])
+    kept = Rows(pointer, local[target], code, rows.shares, mesh.columns)
+    return mesh, np.flatnonzero(found.surviving), kept
+
+
+def _statuses(found: Stabilizable, pair_pointer: Indices) -> Statuses:
+    """Return the status code of every own free cell, as of one process."""
+    status = np.full(len(found.level), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
+    status[~found.reaches] = CellStatus.TRAPPED
+    status[np.diff(pair_pointer) == 0] = CellStatus.ESCAPES
+    status[found.inside[: len(status)]] = CellStatus.STABILIZED
+    return status
+
+
+def _weight(ranks: Ranks, sets: CellSets, cells: Indices) -> Floats:
+    """Return m on own cells of C, scaled to sum 1 over all: as :meth:`CellSets.weight`."""
+    mass = sets.mass[cells]
+    top = max(ranks.collect(float(mass.max(initial=0.0))))
+    if top > 1e290:
+        mass = mass / top
+    every = ranks.collect((len(mass), *_ends_of(mass)))
+    count = sum(n for n, *_ in every)
+    ends = {x for n, low, high, _ in every if n for x in (low, high)}
+    if len(ends) == 1:
+        total = count * ends.pop()
+    else:
+        total = math.fsum(x for *_, exactly in every for x in exactly)
+    return mass / total if total > 0 else np.zeros(len(cells))
+
+
+def _ends_of(mass: Floats) -> tuple[float, float, list[float]]:
+    """Return the least and largest mass, and doubles whose sum is exactly that of all."""
+    exactly: list[float] = []
+    while (rest := math.fsum([*mass, *(-x for x in exactly)])) != 0:
+        exactly.append(rest)
+    return float(mass.min(initial=np.inf)), float(mass.max(initial=0.0)), exactly
+
+
+def local(lp: StabilizationLP) -> StabilizationLP:
+    """Return a whole model as one rank has it that is alone: for what is made over ranks."""
+    from lmdsl.ranks.ranges import Division
+    from lmdsl.ranks.verbs import Alone
+
+    division = Division.cut(np.diff(lp.pair_pointer), 1)
+    return replace(lp, mesh=Mesh.of(Alone(), division, lp.rows.target), _known=lp._algorithm_1)

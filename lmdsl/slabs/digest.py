@@ -1,0 +1,109 @@
+"""The digest of a model that is spread over ranks: equal for every number of ranks.
+
+What a model holds of its cells is hashed in *blocks* of consecutive cells, in global numbers; the
+digest is the hash of the blocks' hashes, in order. A block that ranks share is hashed by the rank
+of its first cell; the others send it their parts. So no rank reads more than its own cells and a
+block, and where cells are cut does not matter.
+"""
+
+import hashlib
+import itertools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Indices
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.ranks.ranges import Division
+from lmdsl.ranks.verbs import Ranks
+
+BLOCK = 1024  # cells of a block
+TITLE = b"lmdsl model 2\n"
+
+
+class ByCell(NamedTuple):
+    """What a model holds of own cells, one after the other."""
+
+    array: NDArray[Any]
+    kind: str  # as what its entries count
+    start: Indices | None = None  # where each own cell begins, and the end; None: one entry each
+
+
+def digest(ranks: Ranks, division: Division, header: bytes, streams: Sequence[ByCell]) -> str:
+    """Return the SHA-256 of streams by cell, the same on every rank; collective."""
+    first, last = division.own(ranks.rank)
+    cut = [first, *range((first // BLOCK + 1) * BLOCK, last, BLOCK), last] if last > first else []
+    parts = {a // BLOCK: _part(streams, a - first, b - first) for a, b in itertools.pairwise(cut)}
+    away = {}
+    if last > first and first % BLOCK:  # its first block begins with another rank's cell
+        owner = int(division.owner(np.array([first - first % BLOCK]))[0])
+        if owner != ranks.rank:
+            away[owner] = _packed(parts.pop(first // BLOCK))
+    for other, came in ranks.exchange(away).items():
+        block = (division.own(other)[0]) // BLOCK
+        parts[block] = [
+            mine + more for mine, more in zip(parts[block], _unpacked(came), strict=True)
+        ]
+    own = b"".join(_hash(parts[block]) for block in sorted(parts))
+    every = ranks.collect(own)
+    sizes = repr((division.cells, BLOCK, [stream.kind for stream in streams])).encode()
+    return hashlib.sha256(TITLE + header + sizes + b"".join(every)).hexdigest()
+
+
+def of_model(ranks: Ranks, lp: StabilizationLP) -> str:
+    """Return the digest of a model, whole or spread over ranks; collective.
+
+    Its blocks hold, of every cell of C: its index in the box, the pairs with their controls and
+    costs, their rows with targets among the cells of C, and its weight. The header holds what every
+    rank has: gamma, the meaning of codes, the controls.
+    """
+    rows, shares, mesh = lp.rows, lp.rows.shares, lp.mesh
+    division = mesh.division if mesh else Division.cut(np.ones(lp.n, dtype=np.int64), 1)
+    target = mesh.numbers[rows.target] if mesh else rows.target
+    below = [*shares.denominator] if shares.total is None else shares.total
+    header = hashlib.sha256(repr((below, [*shares.numerator])).encode()).digest()
+    header += np.array([lp.gamma], dtype="<f8").tobytes()
+    header += hashlib.sha256(np.ascontiguousarray(lp.controls, dtype="<f8").tobytes()).digest()
+    entries = rows.pointer[lp.pair_pointer]
+    return digest(ranks, division, header, (
+        ByCell(lp.cells, "<i8"),
+        ByCell(np.diff(lp.pair_pointer), "<i8"),
+        ByCell(lp.control, "<i4", lp.pair_pointer),
+        ByCell(lp.cost, "<f8", lp.pair_pointer),
+        ByCell(np.diff(rows.pointer), "<i8", lp.pair_pointer),
+        ByCell(target, "<i8", entries),
+        ByCell(rows.code, "<u4", entries),
+        ByCell(lp.weight, "<f8"),
+    ))  # fmt: skip
+
+
+def _part(streams: Sequence[ByCell], a: int, b: int) -> list[bytes]:
+    """Return the bytes of the own cells a..b-1, by stream."""
+    found = []
+    for array, kind, start in streams:
+        i, k = (a, b) if start is None else (int(start[a]), int(start[b]))
+        found.append(np.ascontiguousarray(array[i:k], dtype=kind).tobytes())
+    return found
+
+
+def _hash(part: list[bytes]) -> bytes:
+    sha = hashlib.sha256()
+    for stream in part:
+        sha.update(len(stream).to_bytes(8, "little"))
+        sha.update(stream)
+    return sha.digest()
+
+
+def _packed(part: list[bytes]) -> NDArray[np.uint8]:
+    sizes = np.array([len(part), *map(len, part)], dtype="<i8")
+    return np.frombuffer(sizes.tobytes() + b"".join(part), dtype=np.uint8)
+
+
+def _unpacked(array: NDArray[np.uint8]) -> list[bytes]:
+    data = array.tobytes()
+    count = int.from_bytes(data[:8], "little")
+    sizes = np.frombuffer(data[8 : 8 * (count + 1)], dtype="<i8").tolist()
+    ends = np.cumsum([8 * (count + 1), *sizes]).tolist()
+    return [data[a:b] for a, b in itertools.pairwise(ends)]
