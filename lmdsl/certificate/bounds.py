@@ -32,8 +32,8 @@ NO_BOUNDS, NO_PAIRS = np.empty(0), np.empty(0, dtype=np.int64)
 
 def expected_above(lp: StabilizationLP, policy: Policy, x: Floats, gamma: float) -> Floats:
     """Return an upper bound of gamma P_u x for a policy, shape (n,)."""
-    upper, V = np.empty(lp.n), padded(x)
-    above = _above if never_underflows(lp, x, gamma) else _carefully_above
+    upper, V = np.empty(lp.n), padded(lp, x)
+    above = _above if never_underflows(lp, V, gamma) else _carefully_above
     over_cells(lp, above, policy.view(np.uint64), lp.rows.kernel, gamma, V, upper)
     return upper
 
@@ -45,7 +45,7 @@ def inflow(
 
     The relative error also covers two more operations with the sum. Each of shape (n,).
     """
-    total, entries = np.zeros(lp.n + 1), np.zeros(lp.n + 1)
+    total, entries = np.zeros(lp.rows.columns + 1), np.zeros(lp.rows.columns + 1)
     _inflow(policy.view(np.uint64), lp.rows.kernel, gamma, mu, total, entries)
     terms = entries[:-1] + 8
     absolute = (1 + gamma) * terms * LEAST * (1 + mu.max(initial=0.0))
@@ -72,16 +72,21 @@ def add_above(a: Floats, b: Floats) -> Floats:
 
 def holds_for_all(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> bool:
     """Decide x <= gamma P_a x + G_a for every pair; False also where it cannot be decided."""
-    open_pairs = undecided(lp, x, gamma, cost)
+    V = padded(lp, x)
+    open_pairs = _undecided(lp, V, gamma, cost)
     if open_pairs is None:
         return False
-    return all(exactly_below(lp, int(k), x, gamma, cost) for k in open_pairs)
+    return all(exactly_below(lp, int(k), V, gamma, cost) for k in open_pairs)
 
 
 def undecided(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | None) -> Indices | None:
     """Return the pairs for which x <= gamma P_a x + G_a is not clear; None if too many."""
-    V = padded(x)
-    cost, plain = np.empty(0) if cost is None else cost, never_underflows(lp, x, gamma)
+    V = padded(lp, x)
+    return _undecided(lp, V, gamma, cost)
+
+
+def _undecided(lp: StabilizationLP, V: Floats, gamma: float, cost: Floats | None) -> Indices | None:
+    cost, plain = np.empty(0) if cost is None else cost, never_underflows(lp, V, gamma)
 
     def part(first: int, last: int) -> tuple[int, Indices]:
         found = np.empty(MAX_EXACT, dtype=np.int64)
@@ -99,9 +104,9 @@ def exact_backup(
     lp: StabilizationLP, k: int, x: Floats, gamma: float, cost: Floats | None
 ) -> Fraction:
     """Return gamma P_a x + G_a of one pair exactly."""
-    n = lp.n
+    end = lp.rows.columns
     total = sum(
-        (Fraction(float(x[j])) * share for j, share in lp.rows.exact(k) if j < n), Fraction(0)
+        (Fraction(float(x[j])) * share for j, share in lp.rows.exact(k) if j < end), Fraction(0)
     )
     fixed = Fraction(0) if cost is None else Fraction(float(cost[k]))
     return Fraction(gamma) * total / lp.rows.total(k) + fixed
@@ -134,7 +139,8 @@ def worst_excess(lp: StabilizationLP, V: Floats) -> tuple[float, bool]:
 
     r_a = max(0, V - lower bound of gamma P_a V - G_a), rounded up.
     """
-    x, plain = padded(V), never_underflows(lp, V, lp.gamma)
+    x = padded(lp, V)
+    plain = never_underflows(lp, x, lp.gamma)
     loop, unused = (_open, (NO_PAIRS,)) if plain else (_carefully, (NO_BOUNDS, NO_PAIRS))
     found = over_cells(lp, loop, *lp._kernel, lp.gamma, lp.cost, x, *unused)
     return float(max(worst for _, worst, _ in found)), any(infinite for *_, infinite in found)

@@ -15,9 +15,13 @@ T = TypeVar("T")
 TRANSITIONS_A_RANGE = 500_000
 
 
-def padded(V: Floats) -> Floats:
-    """Append the attractor's 0."""
-    return np.append(np.asarray(V, dtype=np.float64), 0.0)
+def padded(lp: StabilizationLP, V: Floats) -> Floats:
+    """Append the attractor's 0, before it the values of ghosts where cells are spread over ranks.
+
+    Then it is collective: all ranks ask for it, the same number of times.
+    """
+    x = np.asarray(V, dtype=np.float64)
+    return np.append(x, 0.0) if lp.mesh is None else lp.mesh.spread(x)
 
 
 def over_cells(
@@ -25,7 +29,14 @@ def over_cells(
 ) -> list[T]:
     """Call ``loop(first, last, *arguments)`` on ranges of cells that cover C, in threads or not.
 
-    The ranges, ``most`` at most, do not depend on the number of threads; nor do the results.
+    The ranges, ``most`` at most, do not depend on the number of threads; nor do the results. Over
+    ranks they are those of the model.
     """
+    if lp.mesh is not None:
+        first, _ = lp.mesh.division.own(lp.mesh.ranks.rank)
+        own = lp.mesh.division.own_ranges(lp.mesh.ranks.rank)
+        return threads.each(
+            lambda cells: loop(*cells, *arguments), [(a - first, b - first) for a, b in own]
+        )
     count = max(1, min(len(lp.rows.target) // TRANSITIONS_A_RANGE, most, lp.n))
     return threads.each(lambda cells: loop(*cells, *arguments), threads.ranges(lp.n, count))

@@ -30,8 +30,8 @@ def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | No
         terms = int(np.diff(lp.rows.pointer).max(initial=0)) + 8
         least: Floats = improve(lp, x, gamma, np.zeros(lp.K)).value
         return least * (1 - terms * UNIT) * (1 - 4 * UNIT)
-    lower, V = np.empty(lp.n), padded(x)
-    cost, plain = np.empty(0) if cost is None else cost, never_underflows(lp, x, gamma)
+    lower, V = np.empty(lp.n), padded(lp, x)
+    cost, plain = np.empty(0) if cost is None else cost, never_underflows(lp, V, gamma)
     loop, unused = (_below, ()) if plain else (_carefully, (NO_PAIRS,))
     over_cells(lp, loop, *lp._kernel, gamma, cost, V, lower, *unused)
     return lower

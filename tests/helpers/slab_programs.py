@@ -4,7 +4,7 @@ import numpy as np
 from rank_programs import main
 
 import lmdsl as lm
-from lmdsl.slabs import compiling
+from lmdsl.slabs import compiling, solving
 from lmdsl.slabs.digest import of_model
 
 
@@ -31,5 +31,36 @@ def compile_file(ranks, file):
     return joined(ranks, lp), of_model(ranks, lp)
 
 
+def answer(ranks, problem):
+    """The answer of a problem over ranks, as plain data; None where no first policy is found."""
+    lp = compiling.compiled(ranks, problem)
+    found = solving.solved(lp)
+    if found is None:
+        return None
+    witness = found.witness
+    every = ranks.collect((lp.cells, lp.control[witness.policy], *vectors(witness)))
+    names = ("cells", "control", "w", "V_up", "W", "mu")
+    return {
+        **{name: joined_array([own[k] for own in every]) for k, name in enumerate(names)},
+        "certificate": found.certificate.to_dict(),
+        "steps": found.steps,
+    }
+
+
+def vectors(witness):
+    """The vectors of a witness."""
+    return witness.w, witness.V_up, witness.W, witness.mu
+
+
+def joined_array(parts):
+    """A vector of all ranks, None where it is missing."""
+    return None if any(part is None for part in parts) else np.concatenate(parts).tolist()
+
+
+def solve_file(ranks, file):
+    """The answer of a file over ranks."""
+    return answer(ranks, lm.load(file))
+
+
 if __name__ == "__main__":
-    main({"compile_file": compile_file})
+    main({"compile_file": compile_file, "solve_file": solve_file})

@@ -30,7 +30,7 @@ def improve(
     value, policy = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
     gamma = lp.gamma if gamma is None else gamma
     cost = lp.cost if cost is None else cost
-    over_cells(lp, _improve, *lp._kernel, cost, gamma, padded(V), value, policy)
+    over_cells(lp, _improve, *lp._kernel, cost, gamma, padded(lp, V), value, policy)
     return Improvement(value, policy)
 
 
@@ -41,7 +41,7 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
     are visited ``backwards`` or forwards.
     """
     value, policy = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
-    x = padded(V)
+    x = padded(lp, V)
 
     def part(first: int, last: int) -> None:
         own = x.copy()  # the others keep the values from before
@@ -54,7 +54,7 @@ def rise(lp: StabilizationLP, V: Floats, gamma: float, backwards: bool) -> Impro
 def below(lp: StabilizationLP, V: Floats, limit: Floats) -> Bools:
     """Return the columns with Q <= limit at V, shape (K,); ``limit`` has shape (n,)."""
     found = np.empty(lp.K, dtype=np.bool_)
-    over_cells(lp, _below, *lp._kernel, lp.cost, lp.gamma, padded(V), limit, found)
+    over_cells(lp, _below, *lp._kernel, lp.cost, lp.gamma, padded(lp, V), limit, found)
     return found
 
 

@@ -108,7 +108,7 @@ class Screen:
         """
         lp = self.lp
         value, new = np.empty(lp.n), np.empty(lp.n, dtype=np.int64)
-        x, backwards = vectors.padded(V), self.passes % 2 == 1
+        x, backwards = vectors.padded(lp, V), self.passes % 2 == 1
         self.passes += 1
         rivals = Rivals(policy.view(np.uint64), self.rival, self.scale)
         found = Improved(value, new.view(np.uint64), self.policy_cost)
@@ -131,7 +131,7 @@ class Screen:
         first tied column of every cell, shape (n,), and whether a cell has more than one.
         """
         lp = self.lp
-        x, ties = vectors.padded(V), np.empty(lp.K, dtype=np.bool_)
+        x, ties = vectors.padded(lp, V), np.empty(lp.K, dtype=np.bool_)
         first = np.empty(lp.n, dtype=np.int64)
         known = self.policy is not None and np.array_equal(self.policy, policy)
         bound = self.rival if known else np.zeros(lp.n)
