@@ -11,15 +11,14 @@ import numpy as np
 
 from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.common.types import Floats, Policy, TimeUp, never
-from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility import first_policy
-from lmdsl.optimize.policies import bellman, evaluation, iteration, ties
+from lmdsl.optimize.policies import bellman, ties
 from lmdsl.optimize.policies.iteration import TIE
 from lmdsl.optimize.policies.screening import Screen, _least_ratio
-from lmdsl.optimize.witness import _first_try
 from lmdsl.ranks.verbs import RankError
 from lmdsl.slabs import below, judging
+from lmdsl.slabs.evaluating import MOST_GATHERED, ByAll, ByFirst, Evaluator
 from lmdsl.slabs.first import First
 
 RISE, TINY = 1e-9, 1e-300  # relative rise of a value up to which it is rounding
@@ -34,18 +33,26 @@ class Solved:
     steps: int  # improvement steps that changed the policy
 
 
-def solved(lp: StabilizationLP, tolerance: float = 1e-6, time_up: TimeUp = never) -> Solved | None:
-    """Solve a model that is spread over ranks; None where no first policy is found. Collective."""
+def solved(
+    lp: StabilizationLP, tolerance: float = 1e-6, time_up: TimeUp = never,
+    gathered: int = MOST_GATHERED,
+) -> Solved | None:  # fmt: skip
+    """Solve a model that is spread over ranks; None where no first policy is found. Collective.
+
+    Policies of up to ``gathered`` cells are evaluated by rank 0, others by all ranks.
+    """
     first = First(lp)
     if not first.mesh.division.cells:
         return None
     time_up = first.mesh.ranks.time_up(time_up)
-    begun = _begin(first)
+    small = first.mesh.division.cells <= gathered
+    by: Evaluator = ByFirst(first) if small else ByAll(lp, time_up)
+    begun = _begin(first, by)
     if begun is None:
         return None
-    policy, V, screen, steps = _iterated(first, *begun, time_up)
-    policy, value = _ties_broken(first, policy, V, screen, tolerance)
-    witness = _witness(first, policy, value, tolerance)
+    policy, V, screen, steps = _iterated(first, by, *begun, time_up)
+    policy, value = _ties_broken(first, by, policy, V, screen, tolerance)
+    witness = by.witness(policy, value, tolerance)
     certificate = judging.verdict(lp, witness, tolerance)
     if certificate.gap is None or certificate.gap > tolerance:  # the same on every rank
         W = below.lower_vector(lp, value, tolerance, time_up)
@@ -54,7 +61,7 @@ def solved(lp: StabilizationLP, tolerance: float = 1e-6, time_up: TimeUp = never
     return Solved(witness, certificate, steps)
 
 
-def _begin(first: First) -> tuple[Policy, Floats] | None:
+def _begin(first: First, by: Evaluator) -> tuple[Policy, Floats] | None:
     """Return a g-stabilizing policy and V >= T_u V: greedy in a few passes, or Algorithm 1's."""
     lp, ranks = first.lp, first.mesh.ranks
     level, tree = lp._algorithm_1
@@ -63,35 +70,15 @@ def _begin(first: First) -> tuple[Policy, Floats] | None:
     for k in range(4 if few else 0):
         better = bellman.rise(lp, V, lp.growth, k % 2 == 1)
         V = better.value
-        found = _bound(first, better.policy, V) if k in (0, 3) else None
+        found = by.bound(better.policy, V) if k in (0, 3) else None
         if found is not None:
             return better.policy, found
-    found = _bound(first, tree, None)
+    found = by.bound(tree, None)
     return None if found is None else (tree, found)
 
 
-def _bound(first: First, policy: Policy, guess: Floats | None) -> Floats | None:
-    """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
-    under = first.model(policy)
-    near = None if guess is None else first.gathered(guess)
-
-    def found() -> Floats | None:
-        assert under is not None
-        own = np.arange(under.n)
-        if near is None:
-            w, _ = evaluation.stability_vector(under, own)
-        else:
-            w = first_policy._proved(under, own, near, never)
-        if w is None:
-            return None
-        V = iteration.bound(under, own, w)
-        return evaluation.evaluate(under, own) if V is None else V
-
-    return first.told(first.mesh.ranks.agreed(lambda: found() if first.here else None))
-
-
 def _iterated(
-    first: First, policy: Policy, V: Floats, time_up: TimeUp
+    first: First, by: Evaluator, policy: Policy, V: Floats, time_up: TimeUp
 ) -> tuple[Policy, Floats, Screen, int]:
     """Improve a policy until no control is better; return the last, its value, and the steps.
 
@@ -106,7 +93,7 @@ def _iterated(
         if last is not None and (not changed or time_up()):
             return *last, screen, steps
         steps += changed > 0
-        exact = _value(first, done.policy, done.value)
+        exact = by.value(done.policy, done.value)
         _require_fallen(first, V, exact)
         if last is not None and not ranks.any(bool((exact < last[1]).any())):
             return *last, screen, steps  # rounding made a change look better than it is
@@ -123,24 +110,8 @@ def _require_fallen(first: First, before: Floats, after: Floats) -> None:
         raise RankError("a policy that looked better is worse: ranks saw wrong values of others")
 
 
-def _value(first: First, policy: Policy, start: Floats) -> Floats:
-    """Return the value of a g-stabilizing policy."""
-    under, near = first.model(policy), first.gathered(start)
-
-    def found() -> Floats:
-        assert under is not None
-        own = np.arange(under.n)
-        V = evaluation.evaluate(under, own, start=near, transient=True)
-        V = evaluation.evaluate(under, own) if V is None else V
-        if V is None:
-            raise Stopped
-        return V
-
-    return first.scattered(first.mesh.ranks.agreed(lambda: found() if first.here else None))
-
-
 def _ties_broken(
-    first: First, policy: Policy, V: Floats, screen: Screen, tolerance: float
+    first: First, by: Evaluator, policy: Policy, V: Floats, screen: Screen, tolerance: float
 ) -> tuple[Policy, Floats]:
     """Break ties by the rule of one process, among the tied columns alone, on rank 0."""
     lp, ranks = first.lp, first.mesh.ranks
@@ -159,23 +130,9 @@ def _ties_broken(
         chosen = first.chosen(tied, found)
     if not ranks.any(bool((chosen != policy).any())):
         return policy, V
-    better = _bound(first, chosen, None)
+    better = by.bound(chosen, None)
     if better is None:
         return policy, V
-    value = _value(first, chosen, V)
+    value = by.value(chosen, V)
     cost = [sum(ranks.collect(float((lp.weight * x).sum()))) for x in (value, V)]
     return (chosen, value) if cost[0] <= (1 + tolerance / 4) * cost[1] else (policy, V)
-
-
-def _witness(first: First, policy: Policy, V: Floats, tolerance: float) -> Witness:
-    """Return the vectors of a policy's claims, made on rank 0 from its own rows."""
-    under, value = first.model(policy), first.gathered(V)
-
-    def made() -> Witness:
-        assert under is not None
-        return _first_try(under, np.arange(under.n), tolerance, value, never)[0]
-
-    found = first.mesh.ranks.agreed(lambda: made() if first.here else None)
-    names = ("w", "V_up", "W", "mu")
-    own = {name: first.told(None if found is None else getattr(found, name)) for name in names}
-    return Witness(policy, **own)

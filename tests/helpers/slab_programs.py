@@ -31,10 +31,10 @@ def compile_file(ranks, file):
     return joined(ranks, lp), of_model(ranks, lp)
 
 
-def answer(ranks, problem):
+def answer(ranks, problem, gathered=10**6):
     """The answer of a problem over ranks, as plain data; None where no first policy is found."""
     lp = compiling.compiled(ranks, problem)
-    found = solving.solved(lp)
+    found = solving.solved(lp, gathered=gathered)
     if found is None:
         return None
     witness = found.witness

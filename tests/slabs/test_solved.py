@@ -35,15 +35,15 @@ def require_equal(one, found):
     certificate = found["certificate"]
     assert certificate["verified"]
     assert certificate["cost"] == pytest.approx(one.cost, rel=1e-12)
-    assert certificate["contraction"] == pytest.approx(one.contraction, rel=1e-9)
+    assert 0 <= certificate["contraction"] < 1  # which depends on how far w was swept
     assert certificate["gap"] <= 1e-6
 
 
-def alike(problem, counts):
+def alike(problem, counts, gathered=10**6):
     """Require the same answer of each number of ranks, to the bit where it divides the ranges."""
     first = None
     for count in counts:
-        found = as_threads(count, lambda ranks: answer(ranks, problem))
+        found = as_threads(count, lambda ranks: answer(ranks, problem, gathered))
         assert all(each == found[0] for each in found)
         first = first or found[0]
         if count in (1, 2, 4):
@@ -63,6 +63,15 @@ def test_random_problems_are_solved_as_in_one_process(seed):
 def test_the_standard_map_is_solved_as_in_one_process():
     one = lm.solve(MAP)
     for found in alike(lm.load(MAP), (1, 2, 4, 7)):
+        require_equal(one, found)
+
+
+@pytest.mark.parametrize("seed", [*SEEDS, None])
+def test_no_rank_has_to_hold_a_policy(seed):
+    """The same answers where all ranks evaluate."""
+    problem = lm.load(MAP) if seed is None else without_enclosures(seed)
+    one = lm.solve(problem)
+    for found in alike(problem, (1, 2, 4, 3), 0):
         require_equal(one, found)
 
 

@@ -78,12 +78,13 @@ def bicgstab(
     steps: int,
     time_up: TimeUp,
     enough: float,
+    dot: Callable[[Floats, Floats], Any] = lambda u, v: (u * v).sum(),
+    anywhere: Callable[[bool], bool] = bool,
 ) -> Floats:
-    """Solve applied(x) = b to a relative residual ``enough``, or make so many steps."""
+    """Solve applied(x) = b to a relative residual ``enough``, or make so many steps.
 
-    def dot(u: Floats, v: Floats) -> Any:
-        return (u * v).sum()
-
+    Of parts of vectors ``dot`` and ``anywhere`` are told, and answer for the whole.
+    """
     x = np.where(np.isfinite(x), x, 0.0)
     r = b - applied(x)
     shadow, p, rho = r, r, dot(r, r)
@@ -97,9 +98,9 @@ def bicgstab(
         alpha = rho / dot(shadow, q)
         s = r - alpha * q
         t = applied(s)
-        omega = dot(t, s) / dot(t, t) if t.any() else np.float64(0.0)
+        omega = dot(t, s) / dot(t, t) if anywhere(bool(t.any())) else np.float64(0.0)
         following = x + alpha * p + omega * s
-        if not np.isfinite(following).all():
+        if anywhere(not np.isfinite(following).all()):
             break
         x = following
         r = s - omega * t

@@ -1,0 +1,184 @@
+"""Who evaluates the policies of a model that is spread over ranks: rank 0, or all together.
+
+Rank 0 gets the rows of a policy and uses the code of one process, to its bits. From some size on
+the rows of a policy are too many for it; then all ranks sweep, and no rank has more than its own.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from lmdsl.certificate import bounds
+from lmdsl.certificate.checks import MEASURE_TOLERANCE
+from lmdsl.certificate.claims import Witness
+from lmdsl.common.types import Floats, Policy, TimeUp, never
+from lmdsl.machine.deadline import Stopped
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.feasibility import first_policy
+from lmdsl.optimize.linear.gauss_seidel import CEILING
+from lmdsl.optimize.linear.policy_system import of_policy
+from lmdsl.optimize.policies import evaluation, iteration
+from lmdsl.optimize.witness import _first_try
+from lmdsl.ranks.mesh import Mesh
+from lmdsl.slabs import below
+from lmdsl.slabs.first import First
+from lmdsl.slabs.sweeping import SpreadSystem
+
+MOST_GATHERED = 10**6  # cells up to which rank 0 evaluates
+
+
+class Evaluator(Protocol):
+    """What policy iteration asks of policies, of own columns; every method is collective."""
+
+    def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
+        """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
+
+    def value(self, policy: Policy, start: Floats) -> Floats:
+        """Return the value of a g-stabilizing policy."""
+
+    def witness(self, policy: Policy, V: Floats, tolerance: float) -> Witness:
+        """Return the vectors of a policy's claims, made from its own rows; V is its value."""
+
+
+@dataclass(frozen=True)
+class ByFirst:
+    """Rank 0 evaluates."""
+
+    first: First
+
+    def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
+        """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
+        under = self.first.model(policy)
+        near = None if guess is None else self.first.gathered(guess)
+
+        def found() -> Floats | None:
+            assert under is not None
+            own = np.arange(under.n)
+            if near is None:
+                w, _ = evaluation.stability_vector(under, own)
+            else:
+                w = first_policy._proved(under, own, near, never)
+            if w is None:
+                return None
+            V = iteration.bound(under, own, w)
+            return evaluation.evaluate(under, own) if V is None else V
+
+        return self.first.told(
+            self.first.mesh.ranks.agreed(lambda: found() if self.first.here else None)
+        )
+
+    def value(self, policy: Policy, start: Floats) -> Floats:
+        """Return the value of a g-stabilizing policy."""
+        under, near = self.first.model(policy), self.first.gathered(start)
+
+        def found() -> Floats:
+            assert under is not None
+            own = np.arange(under.n)
+            V = evaluation.evaluate(under, own, start=near, transient=True)
+            V = evaluation.evaluate(under, own) if V is None else V
+            if V is None:
+                raise Stopped
+            return V
+
+        return self.first.scattered(
+            self.first.mesh.ranks.agreed(lambda: found() if self.first.here else None)
+        )
+
+    def witness(self, policy: Policy, V: Floats, tolerance: float) -> Witness:
+        """Return the vectors of a policy's claims, made on rank 0 from its own rows."""
+        under, value = self.first.model(policy), self.first.gathered(V)
+
+        def made() -> Witness:
+            assert under is not None
+            return _first_try(under, np.arange(under.n), tolerance, value, never)[0]
+
+        found = self.first.mesh.ranks.agreed(lambda: made() if self.first.here else None)
+        names = ("w", "V_up", "W", "mu")
+        own = {
+            name: self.first.told(None if found is None else getattr(found, name)) for name in names
+        }
+        return Witness(policy, **own)
+
+
+@dataclass(frozen=True)
+class ByAll:
+    """All ranks evaluate, by sweeps."""
+
+    lp: StabilizationLP
+    time_up: TimeUp
+
+    @property
+    def mesh(self) -> Mesh:
+        """The own cells and ghosts of this rank."""
+        assert self.lp.mesh is not None
+        return self.lp.mesh
+
+    def system(self, policy: Policy, gamma: float) -> SpreadSystem:
+        """Return gamma P_u, ready for sweeps."""
+        lp = self.lp
+        rows = of_policy(lp, policy, gamma)
+        return SpreadSystem.of(self.mesh, rows, lp.cells, lp.partition.shape)
+
+    def stable(self, policy: Policy, guess: Floats | None) -> tuple[Floats, Floats] | None:
+        """Return w > 0, d > 0 with w >= g P_u w + d; None where there is none in sight."""
+        unit = np.ones(self.lp.n)
+        system = self.system(policy, self.lp.growth)
+        w = unit.copy() if guess is None else np.maximum(guess, 1.0)
+        for _ in range(first_policy.MOST_ROUNDS):  # it need not be solved to the end
+            change = system.sweep(unit, w, first_policy.SWEEPS, 0.0, 1e-2)[1]
+            found = self.proof(policy, w)
+            if found is not None or not change < np.inf:
+                return found
+        solved = system.solve(unit, w, self.time_up)
+        return None if solved is None else self.proof(policy, solved)
+
+    def proof(self, policy: Policy, w: Floats) -> tuple[Floats, Floats] | None:
+        """Return w with the d > 0 that it leaves, None where it leaves none."""
+        ranks = self.mesh.ranks
+        if not ranks.all(bool((np.isfinite(w) & (w > 0)).all())):  # else not all would ask on
+            return None
+        d = bounds.decrease(self.lp, policy, w, self.lp.growth)
+        return None if ranks.any(d is None) or d is None else (w, d)
+
+    def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
+        """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
+        found = self.stable(policy, guess)
+        if found is None:
+            return None
+        w, d = found
+        with np.errstate(over="ignore"):
+            own = float((self.lp.cost[policy] / d).max(initial=0.0))
+            V = w * (max(self.mesh.ranks.collect(own)) * (1 + 1e-12))
+        return None if self.mesh.ranks.any(not (V < CEILING).all()) else V
+
+    def value(self, policy: Policy, start: Floats) -> Floats:
+        """Return the value of a g-stabilizing policy."""
+        system = self.system(policy, self.lp.gamma)
+        V = system.solve(self.lp.cost[policy], start, self.time_up)
+        if V is None:
+            raise Stopped
+        return V
+
+    def witness(self, policy: Policy, V: Floats, tolerance: float) -> Witness:
+        """Return the vectors of a policy's claims; V is its value."""
+        lp, ranks = self.lp, self.mesh.ranks
+        w, d = self.stable(policy, None) or (None, None)
+        V_up = None if w is None or d is None else self._above(policy, V, w, d)
+        W = below.lower_vector(lp, V, tolerance, self.time_up)
+        turned = self.system(policy, lp.gamma).transposed(lp.cells, lp.partition.shape)
+        flat = 1e-2 * MEASURE_TOLERANCE / sum(ranks.collect(lp.n))
+        mu = turned.solve(lp.weight, lp.weight.copy(), self.time_up, flat)
+        return Witness(policy, w, V_up, W, mu)
+
+    def _above(self, policy: Policy, V: Floats, w: Floats, d: Floats) -> Floats | None:
+        """Return V + delta w that is an upper bound, as one process makes it."""
+        lp, ranks = self.lp, self.mesh.ranks
+        for _ in range(4):
+            future = bounds.expected_above(lp, policy, V, lp.gamma)
+            residual = bounds.add_above(future, lp.cost[policy]) - V
+            share = max(ranks.collect(float((residual / d).max(initial=0.0))))
+            if share <= 0:
+                break
+            V = V + share * 1.01 * w
+        return V

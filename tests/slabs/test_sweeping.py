@@ -1,0 +1,86 @@
+"""Systems over ranks against linear algebra, and to the same bits for 1, 2 and 4 ranks."""
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from lmdsl.common.types import never
+from lmdsl.optimize.linear.gauss_seidel import SplitMatrix
+from lmdsl.ranks.mesh import Mesh
+from lmdsl.ranks.ranges import Division
+from lmdsl.ranks.threaded import as_threads
+from lmdsl.slabs.sweeping import SpreadSystem, named
+
+SHAPE = (12, 10)
+
+
+def matrix(seed, radius, cells=120):
+    """A sparse M >= 0 of a spectral radius, with entries near the diagonal and far from it."""
+    random = np.random.default_rng(seed)
+    M = random.random((cells, cells)) * (random.random((cells, cells)) < 0.03)
+    M[np.arange(cells), (np.arange(cells) + 1) % cells] += 0.5
+    M[random.random(cells) < 0.1] = 0.0
+    return M * (radius / np.abs(np.linalg.eigvals(M)).max())
+
+
+def spread(ranks, M):
+    """The system of a rank, and which cells are its own."""
+    division = Division.cut((M > 0).sum(axis=1), ranks.count)
+    first, last = division.own(ranks.rank)
+    rows = csr_array(M[first:last])
+    mesh = Mesh.of(ranks, division, rows.indices)
+    size = (last - first, mesh.columns)
+    own = SplitMatrix.of(csr_array((rows.data, mesh.local(rows.indices), rows.indptr), shape=size))
+    return SpreadSystem.of(mesh, own, np.arange(first, last), SHAPE), slice(first, last)
+
+
+def solved(count, M, b, what):
+    """What all ranks find, one after the other; None where there is no solution."""
+
+    def program(ranks):
+        system, own = spread(ranks, M)
+        if what == "transposed":
+            system = system.transposed(np.arange(120)[own], SHAPE)
+        if what == "krylov":
+            return system.krylov(b[own], b[own].copy(), never)
+        return system.solve(b[own], b[own].copy(), never)
+
+    found = as_threads(count, program)
+    return None if found[0] is None else np.concatenate(found)
+
+
+@pytest.mark.parametrize("what", ["solve", "transposed", "krylov"])
+@pytest.mark.parametrize(("seed", "radius"), [(0, 0.5), (1, 0.9), (2, 0.999)])
+def test_systems_are_solved(seed, radius, what):
+    M = matrix(seed, radius)
+    b = np.random.default_rng(seed).random(120)
+    exact = np.linalg.solve(np.eye(120) - (M.T if what == "transposed" else M), b)
+    first = solved(1, M, b, what)
+    tolerance = 1e-8 if what == "krylov" else 1e-11
+    for count in (1, 2, 3, 4, 7):
+        found = solved(count, M, b, what)
+        assert np.abs(found / exact - 1).max() <= tolerance
+        if count in (1, 2, 4):
+            assert found.tobytes() == first.tobytes()
+
+
+def test_what_leads_to_nothing_is_exactly_nothing():
+    M = np.diag(np.full(119, 0.5), 1)  # a line: cells before the 60th lead to it
+    b = np.where(np.arange(120) == 60, 1.0, 0.0)
+    for count in (1, 3):
+        found = solved(count, M, b, "solve")
+        assert (found[61:] == 0).all()
+        assert found[:61] == pytest.approx(0.5 ** (60.0 - np.arange(61)), rel=1e-12)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_where_there_is_no_solution_none_is_found(count):
+    assert solved(count, matrix(3, 1.2), np.ones(120), "solve") is None
+
+
+def test_cells_that_rows_name():
+    gaps = SplitMatrix(
+        np.array([0, 4, 6], dtype=np.uint64), np.array([2, 4, 7], dtype=np.uint64),
+        np.array([5, 3, 9, 9, 9, 9, 3], dtype=np.uint32), np.ones(7), np.ones(3), None,
+    )  # fmt: skip
+    assert named(gaps).tolist() == [3, 5]
