@@ -13,6 +13,7 @@ import numpy as np
 from lmdsl.certificate import bounds, checks, sums
 from lmdsl.certificate.bounds import _inflow
 from lmdsl.certificate.claims import Certificate, Witness
+from lmdsl.certificate.judge import REFUSAL
 from lmdsl.common.types import Floats, Policy
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.ranks.reading import Read, added
@@ -23,6 +24,13 @@ def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certific
     """Judge a witness, of own cells and columns; collective, with one outcome for all ranks."""
     assert lp.mesh is not None
     judge = _Judge(lp.mesh.ranks, replace(lp, mesh=Read.again(lp.mesh)))
+    if judge.refusal(witness):
+        return Certificate(
+            stabilizing=False, upper_bound=False, lower_bound=False, measure=False, refusal=True,
+            contraction=None, cost=None, lower=None, gap=None, measure_residual=None,
+            tolerance=tolerance, assumes=lp.problem.system.assumes,
+            reasons=(REFUSAL.sentence(lp, None, None),),
+        )  # fmt: skip
     contraction = judge.contraction(witness)
     upper, lower = judge.upper(witness), judge.lower(witness.W)
     residual, measure = judge.measure(witness)
@@ -59,6 +67,14 @@ class _Judge:
         if policy is None or len(policy) or self.lp.n:
             return self.ranks.all(policy is not None and checks.is_policy(self.lp, policy))
         return self.ranks.all(True)  # no cell at all
+
+    def refusal(self, witness: Witness) -> bool:
+        """Claim 6, of a witness without a policy."""
+        w = witness.refusal
+        if not self.ranks.all(witness.policy is None) or not self.sound(w) or w is None:
+            return False
+        some = self.ranks.any(bool(w.any()))
+        return some & self.ranks.all(bounds.holds_for_all(self.lp, w, self.lp.gamma, None))
 
     def contraction(self, witness: Witness) -> float | None:
         """Claim 1: the bound on rho(g P_u), the largest of all ranks; None where it fails."""

@@ -17,7 +17,7 @@ from lmdsl.optimize.policies import bellman, ties
 from lmdsl.optimize.policies.iteration import TIE
 from lmdsl.optimize.policies.screening import Screen, _least_ratio
 from lmdsl.ranks.verbs import RankError
-from lmdsl.slabs import below, judging
+from lmdsl.slabs import below, judging, refusing
 from lmdsl.slabs.evaluating import MOST_GATHERED, ByAll, ByFirst, Evaluator
 from lmdsl.slabs.first import First
 
@@ -37,7 +37,9 @@ def solved(
     lp: StabilizationLP, tolerance: float = 1e-6, time_up: TimeUp = never,
     gathered: int = MOST_GATHERED,
 ) -> Solved | None:  # fmt: skip
-    """Solve a model that is spread over ranks; None where no first policy is found. Collective.
+    """Solve a model that is spread over ranks; None where it is not decided. Collective.
+
+    Where no first policy is found it is tried to prove that there is none.
 
     Policies of up to ``gathered`` cells are evaluated by rank 0, others by all ranks.
     """
@@ -49,7 +51,9 @@ def solved(
     by: Evaluator = ByFirst(first) if small else ByAll(lp, time_up)
     begun = _begin(first, by)
     if begun is None:
-        return None
+        w = refusing.refusal(lp, time_up)
+        witness = Witness(None, refusal=w)
+        return None if w is None else Solved(witness, judging.verdict(lp, witness, tolerance), 0)
     policy, V, screen, steps = _iterated(first, by, *begun, time_up)
     policy, value = _ties_broken(first, by, policy, V, screen, tolerance)
     witness = by.witness(policy, value, tolerance)

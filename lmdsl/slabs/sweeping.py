@@ -28,7 +28,7 @@ from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, TOLERANCE, SplitM
 from lmdsl.ranks.mesh import Halo, Mesh
 from lmdsl.ranks.verbs import Ranks
 
-MOST_RISING = 4  # trials in a row in which sweeps do not come closer, after which none is in sight
+MOST_RISING = 2  # trials in a row in which sweeps do not come closer, after which none is in sight
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +110,7 @@ class SpreadSystem:
         """Return x >= 0 with x = b + M x from a guess, None where none is in sight; collective."""
         x = np.where(self.positive(b), x, 0.0)
         change, rate = self._trial(b, x, flat)
-        if change > TOLERANCE and not _soon(change, rate, FEW_SWEEPS):
+        if change > TOLERANCE and rate < 1 and not _soon(change, rate, FEW_SWEEPS):
             guess = self.krylov(b, x, time_up)
             if guess is not None:
                 x = np.where(self.positive(b), guess, 0.0)

@@ -38,6 +38,9 @@ def answer(ranks, problem, gathered=10**6):
     if found is None:
         return None
     witness = found.witness
+    if witness.policy is None:
+        return {"certificate": found.certificate.to_dict(),
+                "refusal": joined_array(ranks.collect(witness.refusal))}  # fmt: skip
     every = ranks.collect((lp.cells, lp.control[witness.policy], *vectors(witness)))
     names = ("cells", "control", "w", "V_up", "W", "mu")
     return {

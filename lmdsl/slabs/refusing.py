@@ -1,0 +1,41 @@
+"""A proof over ranks that no policy has finite cost at this gamma (claim 6).
+
+Passes w <- min(w, gamma' min_a P_a w), rounded down, from w = 1 fall to the greatest w <= 1 that
+satisfies w <= gamma' P_a w for every pair; gamma' is just below gamma, so that a pass that lowers w
+by less than that factor leaves a proof at gamma. Where w falls to nothing no cell is beyond gamma
+and nothing is claimed; nor where passes run out, which they do only close to gamma_bar.
+"""
+
+import numpy as np
+
+from lmdsl.certificate import bounds
+from lmdsl.common.types import Floats, TimeUp
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.descent import backup_below
+
+SLACKS = (1e-3, 1e-6, 1e-9)  # relative distance of gamma' from gamma, one after the other
+PASSES = 500  # number of passes for each above which none is in sight
+NOTHING = 1e-12  # value below which a cell counts as one that can be left
+
+
+def refusal(lp: StabilizationLP, time_up: TimeUp) -> Floats | None:
+    """Return w >= 0 of own cells, not 0 everywhere, with w <= gamma P_a w; collective."""
+    assert lp.mesh is not None
+    ranks = lp.mesh.ranks
+    if lp.gamma <= 1:  # then every policy of C that reaches A has finite cost
+        return None
+    free = np.zeros(lp.K)  # with a cost, if 0, each row has a margin of its own, on any rank
+    for slack in SLACKS:
+        w, at = np.ones(lp.n), lp.gamma * (1 - slack)
+        for _ in range(PASSES):
+            lower = np.minimum(w, backup_below(lp, w, at, free))
+            lower[lower < NOTHING] = 0.0
+            settled = ranks.all(bool((lower >= w * (1 - slack / 2)).all()))
+            w = lower
+            if settled or time_up() or not ranks.any(bool(w.any())):
+                break
+        if not ranks.any(bool(w.any())):
+            continue
+        if ranks.all(bounds.holds_for_all(lp, w, lp.gamma, None)):
+            return w
+    return None
