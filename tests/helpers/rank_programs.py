@@ -3,8 +3,11 @@
 Each returns plain data that is to be the same however it is run; rank 0 prints what all returned.
 """
 
+import errno
 import itertools
 import json
+import os
+import signal
 import sys
 import time
 
@@ -78,6 +81,26 @@ def lonely_memory(ranks):
     return ranks.any(False)
 
 
+def killed(ranks):
+    """The last rank is killed while the others wait for it."""
+    if ranks.rank == ranks.count - 1:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return ranks.collect(1)
+
+
+def full_disk(ranks):
+    """One rank cannot write; all are told."""
+
+    def write():
+        if ranks.rank == ranks.count - 1:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "V.npy")
+
+    try:
+        ranks.agreed(write)
+    except OSError as error:
+        return [error.errno == errno.ENOSPC, error.filename]
+
+
 def deadline(ranks):
     """One rank's time is up after a while: all stop in the same round."""
     until = time.monotonic() + (0.05 if ranks.rank == ranks.count - 1 else 1e9)
@@ -143,6 +166,8 @@ PROGRAMS = {
         agreed_error,
         lonely_error,
         lonely_memory,
+        killed,
+        full_disk,
         deadline,
         out_of_step,
         rows_times_values,

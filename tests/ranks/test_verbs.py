@@ -99,6 +99,25 @@ def test_an_error_on_one_process_ends_all(program, status):
     assert time.monotonic() - began < 30  # not for ever: launch ends it after 60
 
 
+@needs_mpi
+def test_a_process_that_is_killed_ends_all():
+    began = time.monotonic()
+    done = launch(3, "killed")
+    assert done.returncode != 0
+    assert "[1, 1" not in done.stdout  # what the launcher itself says is there
+    assert time.monotonic() - began < 30
+
+
+@pytest.mark.parametrize("count", COUNTS)
+def test_a_full_disk_on_one_rank_is_everybodys(count):
+    assert as_threads(count, PROGRAMS["full_disk"]) == [[True, "V.npy"]] * count
+
+
+@needs_mpi
+def test_a_full_disk_under_mpi():
+    assert returned(2, "full_disk") == [[True, "V.npy"]] * 2
+
+
 @pytest.mark.parametrize("count", COUNTS)
 def test_all_stop_in_the_same_round(count):
     assert as_threads(count, PROGRAMS["deadline"]) == [True] * count
