@@ -18,8 +18,8 @@ from lmdsl.optimize.policies.iteration import TIE
 from lmdsl.optimize.policies.screening import Screen, _least_ratio
 from lmdsl.ranks.verbs import RankError
 from lmdsl.slabs import below, judging, refusing
-from lmdsl.slabs.evaluating import MOST_GATHERED, ByAll, ByFirst, Evaluator
-from lmdsl.slabs.first import First
+from lmdsl.slabs.chains.evaluating import MOST_GATHERED, ByAll, ByFirst, Evaluator
+from lmdsl.slabs.chains.first import First
 
 RISE, TINY = 1e-9, 1e-300  # relative rise of a value up to which it is rounding
 

@@ -6,10 +6,12 @@ from scipy.sparse import csr_array
 
 from lmdsl.common.types import never
 from lmdsl.optimize.linear.gauss_seidel import SplitMatrix
+from lmdsl.optimize.linear.substitution import Peeled
 from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.threaded import as_threads
-from lmdsl.slabs.sweeping import SpreadSystem, named
+from lmdsl.slabs.chains.peeling import SpreadPeeled, solve_transposed, transposed
+from lmdsl.slabs.chains.sweeping import SpreadSystem, named
 
 SHAPE = (12, 10)
 
@@ -39,8 +41,15 @@ def solved(count, M, b, what):
 
     def program(ranks):
         system, own = spread(ranks, M)
+        cells = np.arange(120)[own]
+        if what.startswith("peeled"):
+            chain = SpreadPeeled.of(system, cells, SHAPE)
+            if what == "peeled":
+                return chain.solve(b[own], b[own].copy(), never)
+            turned = transposed(chain, cells, SHAPE)
+            return solve_transposed(turned, b[own], never, 0.0)
         if what == "transposed":
-            system = system.transposed(np.arange(120)[own], SHAPE)
+            system = system.transposed(cells, SHAPE)
         if what == "krylov":
             return system.krylov(b[own], b[own].copy(), never)
         return system.solve(b[own], b[own].copy(), never)
@@ -49,12 +58,14 @@ def solved(count, M, b, what):
     return None if found[0] is None else np.concatenate(found)
 
 
-@pytest.mark.parametrize("what", ["solve", "transposed", "krylov"])
+@pytest.mark.parametrize("what", ["solve", "transposed", "krylov", "peeled", "peeled, transposed"])
 @pytest.mark.parametrize(("seed", "radius"), [(0, 0.5), (1, 0.9), (2, 0.999)])
 def test_systems_are_solved(seed, radius, what):
     M = matrix(seed, radius)
     b = np.random.default_rng(seed).random(120)
-    exact = np.linalg.solve(np.eye(120) - (M.T if what == "transposed" else M), b)
+    if what.startswith("peeled"):
+        M[:, 100:] = 0.0  # nobody leads to the last cells: outside the core
+    exact = np.linalg.solve(np.eye(120) - (M.T if what.endswith("transposed") else M), b)
     first = solved(1, M, b, what)
     tolerance = 1e-8 if what == "krylov" else 1e-11
     for count in (1, 2, 3, 4, 7):
@@ -62,6 +73,46 @@ def test_systems_are_solved(seed, radius, what):
         assert np.abs(found / exact - 1).max() <= tolerance
         if count in (1, 2, 4):
             assert found.tobytes() == first.tobytes()
+
+
+def grown(ways, cells=120):
+    """A forest that leads to a cycle: entries of every cell but the first three go down."""
+    random = np.random.default_rng(ways)
+    M = np.zeros((cells, cells))
+    M[[0, 1, 2], [1, 2, 0]] = 0.9
+    for i in range(3, cells):
+        M[i, random.integers(max(0, i - ways), i, 2)] = 0.4
+        M[i, random.integers(0, i)] = 0.1
+    return M
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 7])
+@pytest.mark.parametrize("ways", [1, 4, 60])
+def test_the_core_is_that_of_one_process(count, ways):
+    """However often ways cross from rank to rank."""
+    shuffled = np.random.default_rng(ways).permutation(120)
+    M, b = grown(ways)[np.ix_(shuffled, shuffled)], np.linspace(1, 2, 120)
+    one = Peeled.of(SplitMatrix.of(csr_array(M)))
+
+    def program(ranks):
+        system, own = spread(ranks, M)
+        chain = SpreadPeeled.of(system, np.arange(120)[own], SHAPE)
+        return np.arange(120)[own][chain.core]
+
+    core = np.concatenate(as_threads(count, program))
+    assert core.tolist() == one.core.tolist()
+    assert (np.sort(shuffled[core]) < 3).all()
+    for what, exact in (("peeled", M), ("peeled, transposed", M.T)):
+        found = solved(count, M, b, what)
+        assert np.abs(found / np.linalg.solve(np.eye(120) - exact, b) - 1).max() < 1e-12
+
+
+def test_outside_the_core_there_may_be_no_solution():
+    M = grown(1)
+    M[50, 50] = 1.0
+    for what in ("peeled", "peeled, transposed"):
+        for count in (1, 3):
+            assert solved(count, M, np.ones(120), what) is None
 
 
 def test_what_leads_to_nothing_is_exactly_nothing():

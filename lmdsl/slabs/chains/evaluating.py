@@ -17,13 +17,12 @@ from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility import first_policy
 from lmdsl.optimize.linear.gauss_seidel import CEILING
-from lmdsl.optimize.linear.policy_system import of_policy
 from lmdsl.optimize.policies import evaluation, iteration
 from lmdsl.optimize.witness import _first_try
 from lmdsl.ranks.mesh import Mesh
 from lmdsl.slabs import below
-from lmdsl.slabs.first import First
-from lmdsl.slabs.sweeping import SpreadSystem
+from lmdsl.slabs.chains import peeling
+from lmdsl.slabs.chains.first import First
 
 MOST_GATHERED = 10**6  # cells up to which rank 0 evaluates
 
@@ -114,21 +113,16 @@ class ByAll:
         assert self.lp.mesh is not None
         return self.lp.mesh
 
-    def system(self, policy: Policy, gamma: float) -> SpreadSystem:
-        """Return gamma P_u, ready for sweeps."""
-        lp = self.lp
-        rows = of_policy(lp, policy, gamma)
-        return SpreadSystem.of(self.mesh, rows, lp.cells, lp.partition.shape)
-
     def stable(self, policy: Policy, guess: Floats | None) -> tuple[Floats, Floats] | None:
         """Return w > 0, d > 0 with w >= g P_u w + d; None where there is none in sight."""
         unit = np.ones(self.lp.n)
-        system = self.system(policy, self.lp.growth)
+        system = peeling.of_chain(self.lp, policy, self.lp.growth)
         w = unit.copy() if guess is None else np.maximum(guess, 1.0)
         for _ in range(first_policy.MOST_ROUNDS):  # it need not be solved to the end
-            change = system.sweep(unit, w, first_policy.SWEEPS, 0.0, 1e-2)[1]
+            if not system.advance(unit, w, first_policy.SWEEPS, 1e-2) < np.inf:
+                return None
             found = self.proof(policy, w)
-            if found is not None or not change < np.inf:
+            if found is not None:
                 return found
         solved = system.solve(unit, w, self.time_up)
         return None if solved is None else self.proof(policy, solved)
@@ -154,7 +148,7 @@ class ByAll:
 
     def value(self, policy: Policy, start: Floats) -> Floats:
         """Return the value of a g-stabilizing policy."""
-        system = self.system(policy, self.lp.gamma)
+        system = peeling.of_chain(self.lp, policy, self.lp.gamma)
         V = system.solve(self.lp.cost[policy], start, self.time_up)
         if V is None:
             raise Stopped
@@ -166,9 +160,10 @@ class ByAll:
         w, d = self.stable(policy, None) or (None, None)
         V_up = None if w is None or d is None else self._above(policy, V, w, d)
         W = below.lower_vector(lp, V, tolerance, self.time_up)
-        turned = self.system(policy, lp.gamma).transposed(lp.cells, lp.partition.shape)
+        chain = peeling.of_chain(lp, policy, lp.gamma)
+        turned = peeling.transposed(chain, lp.cells, lp.partition.shape)
         flat = 1e-2 * MEASURE_TOLERANCE / sum(ranks.collect(lp.n))
-        mu = turned.solve(lp.weight, lp.weight.copy(), self.time_up, flat)
+        mu = peeling.solve_transposed(turned, lp.weight, self.time_up, flat)
         return Witness(policy, w, V_up, W, mu)
 
     def _above(self, policy: Policy, V: Floats, w: Floats, d: Floats) -> Floats | None:
