@@ -11,6 +11,7 @@ import numpy as np
 
 from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.common.types import Floats, Policy, TimeUp, never
+from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility import first_policy
 from lmdsl.optimize.policies import bellman, ties
@@ -97,7 +98,10 @@ def _iterated(
         if last is not None and (not changed or time_up()):
             return *last, screen, steps
         steps += changed > 0
-        exact = by.value(done.policy, done.value)
+        try:
+            exact = by.value(done.policy, done.value)
+        except Stopped:  # on all ranks
+            return *(last or (policy, V)), screen, steps
         _require_fallen(first, V, exact)
         if last is not None and not ranks.any(bool((exact < last[1]).any())):
             return *last, screen, steps  # rounding made a change look better than it is

@@ -60,9 +60,9 @@ def joined_array(parts):
     return None if any(part is None for part in parts) else np.concatenate(parts).tolist()
 
 
-def solve_file(ranks, file):
+def solve_file(ranks, file, gathered=str(10**6)):
     """The answer of a file over ranks."""
-    return answer(ranks, lm.load(file))
+    return answer(ranks, lm.load(file), int(gathered))
 
 
 if __name__ == "__main__":

@@ -65,6 +65,7 @@ def test_the_standard_map(count):
     assert as_threads(count, lambda ranks: compile_file(ranks, file)) == [expected] * count
 
 
+@pytest.mark.long
 @needs_mpi
 def test_the_standard_map_under_mpi():
     file = str(EXAMPLES / "standard_map.json")

@@ -75,12 +75,30 @@ def test_no_rank_has_to_hold_a_policy(seed):
         require_equal(one, found)
 
 
+@pytest.mark.long
 @needs_mpi
-def test_the_standard_map_under_mpi():
+@pytest.mark.parametrize("gathered", ["1000000", "0"])
+def test_the_standard_map_under_mpi(gathered):
     one = lm.solve(MAP)
-    found = returned(2, "solve_file", MAP, script="slab_programs.py")
-    assert found[0] == found[1] == as_threads(2, lambda ranks: solve_file(ranks, MAP))[0]
+    found = returned(2, "solve_file", MAP, gathered, script="slab_programs.py")
+    assert found[0] == found[1] == as_threads(2, lambda r: solve_file(r, MAP, gathered))[0]
     require_equal(one, found[0])
+
+
+def test_one_rank_without_time_ends_the_work_of_all():
+    """With the policy at hand: what holds of it is claimed, and no more."""
+
+    def program(ranks, gathered):
+        lp = compiling.compiled(ranks, lm.load(MAP))
+        found = solving.solved(lp, time_up=lambda: ranks.rank == 1, gathered=gathered)
+        return found.steps, found.certificate
+
+    for gathered in (10**6, 0):
+        found = as_threads(3, lambda ranks, g=gathered: program(ranks, g))
+        assert found == [found[0]] * 3
+        assert found[0][0] <= 1
+        assert found[0][1].stabilizing
+        assert found[0][1].upper_bound
 
 
 def test_what_no_policy_can_do_is_not_claimed():

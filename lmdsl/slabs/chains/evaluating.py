@@ -4,7 +4,7 @@ Rank 0 gets the rows of a policy and uses the code of one process, to its bits. 
 the rows of a policy are too many for it; then all ranks sweep, and no rank has more than its own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -106,6 +106,17 @@ class ByAll:
 
     lp: StabilizationLP
     time_up: TimeUp
+    # gamma: the last policy, and its chain
+    last: dict[float, tuple[Policy, peeling.SpreadPeeled]] = field(default_factory=dict)
+
+    def chain(self, policy: Policy, gamma: float) -> peeling.SpreadPeeled:
+        """Return gamma P_u; the last one is kept."""
+        known = self.last.get(gamma)
+        same = known is not None and np.array_equal(known[0], policy)
+        if self.mesh.ranks.all(same) and known is not None:
+            return known[1]
+        self.last[gamma] = policy.copy(), peeling.of_chain(self.lp, policy, gamma)
+        return self.last[gamma][1]
 
     @property
     def mesh(self) -> Mesh:
@@ -116,7 +127,7 @@ class ByAll:
     def stable(self, policy: Policy, guess: Floats | None) -> tuple[Floats, Floats] | None:
         """Return w > 0, d > 0 with w >= g P_u w + d; None where there is none in sight."""
         unit = np.ones(self.lp.n)
-        system = peeling.of_chain(self.lp, policy, self.lp.growth)
+        system = self.chain(policy, self.lp.growth)
         w = unit.copy() if guess is None else np.maximum(guess, 1.0)
         for _ in range(first_policy.MOST_ROUNDS):  # it need not be solved to the end
             if not system.advance(unit, w, first_policy.SWEEPS, 1e-2) < np.inf:
@@ -148,7 +159,7 @@ class ByAll:
 
     def value(self, policy: Policy, start: Floats) -> Floats:
         """Return the value of a g-stabilizing policy."""
-        system = peeling.of_chain(self.lp, policy, self.lp.gamma)
+        system = self.chain(policy, self.lp.gamma)
         V = system.solve(self.lp.cost[policy], start, self.time_up)
         if V is None:
             raise Stopped
@@ -160,7 +171,7 @@ class ByAll:
         w, d = self.stable(policy, None) or (None, None)
         V_up = None if w is None or d is None else self._above(policy, V, w, d)
         W = below.lower_vector(lp, V, tolerance, self.time_up)
-        chain = peeling.of_chain(lp, policy, lp.gamma)
+        chain = self.chain(policy, lp.gamma)
         turned = peeling.transposed(chain, lp.cells, lp.partition.shape)
         flat = 1e-2 * MEASURE_TOLERANCE / sum(ranks.collect(lp.n))
         mu = peeling.solve_transposed(turned, lp.weight, self.time_up, flat)

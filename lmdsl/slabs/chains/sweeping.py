@@ -75,11 +75,14 @@ class SpreadSystem:
     def sweep(
         self, b: Floats, x: Floats, count: int, enough: float = TOLERANCE, flat: float = 0.0
     ) -> tuple[float, float]:
-        """Make Gauss-Seidel sweeps on own values in place; see :meth:`SplitMatrix.sweep`."""
+        """Make Gauss-Seidel sweeps on own values in place; see :meth:`SplitMatrix.sweep`.
+
+        They are not measured where ``enough`` is negative.
+        """
         now = self.mesh.spread(x, 0.0, self.halo)
         then, halfway, change, top = now.copy(), np.inf, np.inf, 0.0
         for sweep in range(count):
-            measured = sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1
+            measured = enough >= 0 and (sweep % 4 == 3 or sweep == count // 2 or sweep == count - 1)
             order, downwards = self.cycle[sweep % len(self.cycle)]
             found = [(0.0, 0.0, 0.0)]
             then[len(x) :] = now[len(x) :]  # the ghosts: a range that is alone reads them there
