@@ -67,8 +67,11 @@ def assembled(
     ranks: Ranks, problem: Problem, partition: Partition, deadline: Deadline | None = None
 ) -> OwnPairs:
     """Return the own pairs of this rank; collective. Raises what :func:`assemble` does."""
+    from lmdsl import __version__
+
     deadline = Deadline.of(deadline)
     ranks.agreed(lambda: require_supported(problem))
+    ranks.alike((__version__, np.__version__), "versions of lmdsl and NumPy")
     ranks.alike(problem.model_dump_json(), "problems")
     sets = ranks.agreed(lambda: CellSets.of(problem, partition, deadline))
     division = ranks.agreed(lambda: divided(problem, partition, sets, ranks.count, deadline))

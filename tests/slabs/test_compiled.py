@@ -17,7 +17,7 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.ranks.threaded import as_threads
 from lmdsl.ranks.verbs import Alone, RankError
-from lmdsl.slabs import compiling, digest
+from lmdsl.slabs import compiling, digest, levels
 from lmdsl.slabs.digest import of_model
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -98,6 +98,13 @@ def test_random_problems(seed, monkeypatch):
     """With noise, avoid cells, measures, and cells that are lost one after the other."""
     problem = without_enclosures(seed)
     compared(problem, (2, 3, 7), monkeypatch)
+
+
+@pytest.mark.parametrize("seed", [1, 3, 7, 11])
+@pytest.mark.parametrize("patience", [0, 1])
+def test_levels_are_the_same_by_sweeps_and_by_a_search(seed, patience, monkeypatch):
+    monkeypatch.setattr(levels, "PATIENCE", patience)
+    compared(without_enclosures(seed), (1, 3, 4), monkeypatch)
 
 
 def test_random_problems_lose_cells():
