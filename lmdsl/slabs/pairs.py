@@ -15,6 +15,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.sampler import Block, Sampler
 from lmdsl.model.assembly.transitions import assemble
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local.controller import LocalController
 from lmdsl.model.rows import Rows
 from lmdsl.model.sets import CellSets
 from lmdsl.problem import Problem
@@ -54,9 +55,10 @@ class OwnPairs:
 
 def require_supported(problem: Problem) -> None:
     """Refuse what does not run over ranks."""
+    local = problem.local_controller
     faults = (
         (problem.successors == "enclosed", "successors", '"enclosed" successors'),
-        (problem.local_controller is not None, "local_controller", "a local controller"),
+        (local is not None and local.kind == "hold", "local_controller", 'the kind "hold"'),
     )
     for asked, where, what in faults:
         if asked:
@@ -74,6 +76,8 @@ def assembled(
     ranks.alike((__version__, np.__version__), "versions of lmdsl and NumPy")
     ranks.alike(problem.model_dump_json(), "problems")
     sets = ranks.agreed(lambda: CellSets.of(problem, partition, deadline))
+    if problem.local_controller is not None:  # refuse a wrong one before the work
+        ranks.agreed(lambda: LocalController.of(problem, partition, sets.attractor, deadline))
     division = ranks.agreed(lambda: divided(problem, partition, sets, ranks.count, deadline))
     span = division.own(ranks.rank)
     own = ranks.agreed(

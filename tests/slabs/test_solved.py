@@ -66,6 +66,22 @@ def test_the_standard_map_is_solved_as_in_one_process():
         require_equal(one, found)
 
 
+FEW = ("double_integrator", "henon_map", "logistic_map", "standard_map_held")
+MORE = ("van_der_pol", "inverted_pendulum", "lorenz", "pendulum_on_cart")
+
+
+@pytest.mark.parametrize(
+    "name", [*FEW, *(pytest.param(name, marks=pytest.mark.long) for name in MORE)]
+)
+def test_shipped_systems_are_solved_as_in_one_process(name):
+    problem = lm.load(EXAMPLES / f"{name}.json")
+    one = lm.solve(problem)
+    for count in (2, 3):
+        for gathered in (10**6, 0):
+            every = as_threads(count, lambda ranks, g=gathered: answer(ranks, problem, g))
+            require_equal(one, every[0])
+
+
 @pytest.mark.parametrize("seed", [*SEEDS, None])
 def test_no_rank_has_to_hold_a_policy(seed):
     """The same answers where all ranks evaluate."""
