@@ -192,6 +192,24 @@ class Mesh:
             cell = self.numbers[targets[bad[0]]]
             raise RankError(f"rank {self.ranks.rank} reads cell {cell}, which nobody sends")
 
+    def tell(self, x: NDArray[np.float64], halo: Halo, told: dict[int, NDArray[np.bool_]]) -> None:
+        """Tell others the values that are known by now, not NaN, each once; collective.
+
+        x has the values of own cells and ghosts; ``told`` is who knows which, nothing at first.
+        Values come with the numbers of their cells.
+        """
+        first, _ = self.division.own(self.ranks.rank)
+        parcels = {}
+        for to, cells in halo.send.items():
+            known = ~np.isnan(x[cells])
+            news = cells[known & ~told.get(to, np.zeros(len(cells), dtype=np.bool_))]
+            told[to] = known
+            if len(news):
+                parcels[to] = np.concatenate([(news + first).astype(np.float64), x[news]])
+        for came in self.ranks.exchange(parcels).values():
+            numbers, values = np.split(came, 2)
+            x[self.local(numbers.astype(np.int64))] = values
+
     def spread(
         self, own: NDArray[Any], attractor: Any = 0.0, halo: Halo | None = None
     ) -> NDArray[Any]:

@@ -123,6 +123,26 @@ def test_a_plan_of_some_ghosts_leaves_the_others_nan(count):
     assert sum(as_threads(count, program)) > 0
 
 
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_values_are_told_once_as_they_become_known(count):
+    def program(ranks):
+        mesh, *_ = own_rows(ranks)
+        numbers, told = mesh.numbers.astype(float), {}
+        x = np.full(mesh.columns + 1, np.nan)
+        sent = []
+        for known in (3, 2, 2, 1):  # every third cell, then every second, then all
+            at = np.arange(mesh.own)[mesh.numbers[: mesh.own] % known == 0]
+            x[at] = numbers[at]
+            before = ranks.traffic.sent
+            mesh.tell(x, mesh.halo, told)
+            sent.append(ranks.traffic.sent - before)
+        assert (x[:-1] == numbers[:-1]).all()
+        assert sent[2] == 0
+        assert sum(sent) == 16 * sum(map(len, mesh.halo.send.values()))
+
+    as_threads(count, program)
+
+
 # Negative controls: what a wrong plan would do to the answer, no claim sees.
 
 

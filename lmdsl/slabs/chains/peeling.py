@@ -80,11 +80,14 @@ class SpreadPeeled:
 
 def _substituted(whole: SpreadSystem, order: NDArray[np.uint32], b: Floats, x: Floats) -> bool:
     """Fill in the cells of an order, NaN where not known yet; False where one is infinite."""
-    ranks, own = whole.ranks, len(x)
+    mesh, ranks = whole.mesh, whole.ranks
+    values = np.full(mesh.columns + 1, np.nan)
+    values[: len(x)], values[mesh.columns] = x, 0.0
+    told: dict[int, Bools] = {}
     while True:
-        values = whole.mesh.spread(x, 0.0, whole.halo)
+        mesh.tell(values, whole.halo, told)
         left, finite = _fill(order, whole.system.kernel, b, values)
-        x[:] = values[:own]
+        x[:] = values[: len(x)]
         every = ranks.collect((int(left), bool(finite)))
         if not all(good for _, good in every):
             return False
