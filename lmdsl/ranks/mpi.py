@@ -16,7 +16,7 @@ from lmdsl.ranks.verbs import Alone, Item, RankError, Ranks, require_expected
 
 # Environment variables of which a launcher sets one: the number of ranks.
 LAUNCHED = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "PMIX_SIZE", "MPI_LOCALNRANKS")
-TAG = 7  # of messages between two ranks
+TAG, TROUBLE = 7, 8  # of messages between two ranks, and of those that one has failed
 KINDS = "?bhilqBHILQfd"  # types of arrays, by NumPy's character
 
 
@@ -26,6 +26,24 @@ class MpiRanks(Ranks):
     def __init__(self, world: Any) -> None:
         self.world = world.Dup()  # apart from what others send
         super().__init__(self.world.Get_rank(), self.world.Get_size())
+        self._told: list[Any] = []  # messages of trouble that are on their way
+
+    def trouble(self) -> bool:
+        """Return whether another rank has failed in the work that is agreed now."""
+        from mpi4py import MPI
+
+        return bool(self.world.Iprobe(MPI.ANY_SOURCE, TROUBLE))
+
+    def _warn(self) -> None:
+        others = [k for k in range(self.count) if k != self.rank]
+        self._told = [self.world.Isend(np.empty(0, np.uint8), k, TROUBLE) for k in others]
+
+    def _calm(self, failed: list[int]) -> None:
+        for k in failed:
+            if k != self.rank:
+                self.world.Recv(np.empty(0, np.uint8), k, TROUBLE)
+        while self._told:
+            self._told.pop().Wait()
 
     def _exchange(self, parcels: dict[int, NDArray[Any]]) -> dict[int, NDArray[Any]]:
         # Of every array: its place in the series, type and size; -1 where none is sent.

@@ -26,6 +26,7 @@ class Board:
     def __init__(self, count: int) -> None:
         self.meeting = threading.Barrier(count)
         self.said: list[Any] = [None] * count
+        self.failed = 0  # number of the verb before which a rank failed
 
 
 class ThreadRanks(Ranks):
@@ -34,6 +35,16 @@ class ThreadRanks(Ranks):
     def __init__(self, rank: int, board: Board) -> None:
         super().__init__(rank, len(board.said))
         self.board = board
+
+    def trouble(self) -> bool:
+        """Return whether another rank has failed in the work that is agreed now."""
+        return self.board.failed > self.traffic.calls
+
+    def _warn(self) -> None:
+        self.board.failed = self.traffic.calls + 1
+
+    def _calm(self, failed: list[int]) -> None:
+        pass  # later work has a later number
 
     def _met(self, verb: str, item: Any) -> list[Any]:
         """Say something; return what all said. It is read before anybody says more."""

@@ -33,6 +33,10 @@ class RankError(LmdslError, RuntimeError):
     """Ranks do not fit together: what one said is not what another one expects."""
 
 
+class Elsewhere(RankError):
+    """The work was ended because another rank has failed: a consequence, not a reason."""
+
+
 @dataclass
 class Traffic:
     """What a rank has said so far."""
@@ -139,7 +143,9 @@ class Ranks(ABC):
     def agreed(self, work: Callable[[], Item]) -> Item:
         """Return ``work()``, in which no verb is said; its error is raised on every rank.
 
-        Of several errors it is that of the lowest rank.
+        Of several errors it is that of the lowest rank, of those that are no consequence of
+        another. Long work asks a :class:`~lmdsl.ranks.watching.Watched` deadline, which ends it
+        once another rank has failed.
         """
         outcome: Any = None
         error: Exception | None = None
@@ -147,7 +153,12 @@ class Ranks(ABC):
             outcome = work()
         except Exception as raised:
             error = raised
-        first = next((e for e in self.collect(error) if e is not None), None)
+            if not isinstance(error, Elsewhere):
+                self._warn()
+        every = self.collect(error)
+        failed = [k for k, e in enumerate(every) if e is not None and not isinstance(e, Elsewhere)]
+        self._calm(failed)
+        first = next((every[k] for k in failed), None)
         if first is not None:
             vars(first)["agreed"] = True  # see :func:`lmdsl.ranks.ending.together`
             raise first
@@ -162,6 +173,18 @@ class Ranks(ABC):
                 f"ranks see different {what}: rank {odd[0]} has {every[odd[0]]!r}, rank 0 "
                 f"{every[0]!r}; start all of them from the same folder, file and installation"
             )
+
+    @abstractmethod
+    def trouble(self) -> bool:
+        """Return whether another rank has failed in the work that is agreed now."""
+
+    @abstractmethod
+    def _warn(self) -> None:
+        """Tell the others, in their work, that this rank has failed in the same."""
+
+    @abstractmethod
+    def _calm(self, failed: list[int]) -> None:
+        """Note which ranks had failed, once all have ended their work."""
 
     @abstractmethod
     def _exchange(self, parcels: dict[int, NDArray[Any]]) -> dict[int, NDArray[Any]]: ...
@@ -180,6 +203,16 @@ class Alone(Ranks):
 
     def __init__(self) -> None:
         super().__init__(0, 1)
+
+    def trouble(self) -> bool:
+        """Return False: there is no other rank."""
+        return False
+
+    def _warn(self) -> None:
+        pass
+
+    def _calm(self, failed: list[int]) -> None:
+        pass
 
     def _exchange(self, parcels: dict[int, NDArray[Any]]) -> dict[int, NDArray[Any]]:
         return {}

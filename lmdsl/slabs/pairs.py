@@ -22,6 +22,7 @@ from lmdsl.problem import Problem
 from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.verbs import Ranks
+from lmdsl.ranks.watching import Watched
 from lmdsl.systems import MatrixSystem
 
 LOOKED_AT = 64  # cells of which the admissible pairs are counted, to share pairs equally
@@ -71,7 +72,7 @@ def assembled(
     """Return the own pairs of this rank; collective. Raises what :func:`assemble` does."""
     from lmdsl import __version__
 
-    deadline = Deadline.of(deadline)
+    deadline = Watched(ranks, Deadline.of(deadline))
     ranks.agreed(lambda: require_supported(problem))
     ranks.alike((__version__, np.__version__), "versions of lmdsl and NumPy")
     ranks.alike(problem.model_dump_json(), "problems")

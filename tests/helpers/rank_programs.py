@@ -14,10 +14,12 @@ import time
 import numpy as np
 
 from lmdsl.errors import BadInput
+from lmdsl.machine.deadline import Deadline
 from lmdsl.ranks.ending import together
 from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.mpi import at_hand
 from lmdsl.ranks.ranges import Division
+from lmdsl.ranks.watching import Watched
 
 
 def verbs(ranks):
@@ -79,6 +81,27 @@ def lonely_memory(ranks):
     if ranks.rank == ranks.count - 1:
         raise KeyboardInterrupt
     return ranks.any(False)
+
+
+def early(ranks):
+    """One rank fails in work that takes the others long: how long all take, and what is raised."""
+    began, found = time.monotonic(), []
+    for fails in (0, ranks.count - 1):
+
+        def work(rank=fails):
+            if ranks.rank == rank:
+                raise BadInput(f"met by rank {rank}")
+            deadline = Watched(ranks, Deadline(30.0))
+            while True:
+                deadline.raise_if_over("testing")
+                time.sleep(0.01)
+
+        try:
+            ranks.agreed(work)
+        except BadInput as error:
+            found.append(str(error))
+        ranks.agreed(lambda: None)  # which the trouble before does not end
+    return found, time.monotonic() - began < 15
 
 
 def killed(ranks):
@@ -166,6 +189,7 @@ PROGRAMS = {
         agreed_error,
         lonely_error,
         lonely_memory,
+        early,
         killed,
         full_disk,
         deadline,

@@ -11,9 +11,11 @@ from launching import launch, needs_mpi, returned
 from rank_programs import PROGRAMS
 
 from lmdsl.errors import BadInput, MissingDependency
+from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.ranks import mpi
 from lmdsl.ranks.threaded import as_threads
 from lmdsl.ranks.verbs import Alone, RankError, Traffic
+from lmdsl.ranks.watching import Watched
 
 COUNTS = [1, 2, 3, 4, 7]
 
@@ -97,6 +99,31 @@ def test_an_error_on_one_process_ends_all(program, status):
     assert "rank 1 of 2: " in done.stderr
     assert "Traceback" not in done.stderr
     assert time.monotonic() - began < 30  # not for ever: launch ends it after 60
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_long_work_ends_when_another_rank_fails(count):
+    words = ["met by rank 0", f"met by rank {count - 1}"]
+    assert as_threads(count, PROGRAMS["early"]) == [(words, True)] * count
+
+
+@needs_mpi
+def test_long_work_of_processes_ends_when_another_one_fails():
+    words = ["met by rank 0", "met by rank 1"]
+    assert returned(2, "early") == [[words, True]] * 2
+
+
+def test_a_watched_deadline_passes_when_its_own_does():
+    watched = Watched(Alone(), Deadline(0.01))
+    assert 0 < watched.left <= 0.01
+    time.sleep(0.02)
+    assert watched()
+    with pytest.raises(TimeLimitReached, match="testing"):
+        watched.raise_if_over("testing")
+    watched = Watched(Alone(), Deadline())
+    assert not watched()
+    watched.cancel()
+    assert watched()
 
 
 @needs_mpi

@@ -1,0 +1,44 @@
+"""Deadlines that also pass once another rank has failed: nobody waits for the end of vain work."""
+
+import threading
+import time
+
+from lmdsl.machine.deadline import Deadline
+from lmdsl.ranks.verbs import Elsewhere, Ranks
+
+EVERY = 0.1  # seconds after which it is asked again
+
+
+class Watched(Deadline):
+    """A deadline of work that all ranks do together (:meth:`Ranks.agreed`).
+
+    Only the thread of the rank asks the others; those that help it are told by it.
+    """
+
+    def __init__(self, ranks: Ranks, deadline: Deadline) -> None:
+        super().__init__(None)
+        self.seconds, self.ranks, self.deadline = deadline.seconds, ranks, deadline
+        self._thread, self._asked, self._failed = threading.get_ident(), 0.0, False
+
+    @property
+    def failed(self) -> bool:
+        """Whether another rank has failed."""
+        now = time.monotonic()
+        if threading.get_ident() == self._thread and now - self._asked > EVERY:
+            self._asked, self._failed = now, self.ranks.trouble()
+        return self._failed
+
+    def __call__(self) -> bool:
+        """Return whether the time is up, or nobody waits any more."""
+        return super().__call__() or self.failed or self.deadline()
+
+    @property
+    def left(self) -> float | None:
+        """Seconds that are left, positive even after it; None for no limit."""
+        return self.deadline.left
+
+    def raise_if_over(self, doing: str) -> None:
+        """Raise :class:`Elsewhere` once another rank has failed, or that the time is up."""
+        if self.failed:
+            raise Elsewhere(f"another rank has failed while {doing}")
+        super().raise_if_over(doing)
