@@ -28,7 +28,8 @@ from lmdsl.slabs.pairs import OwnPairs, assembled
 def compiled(ranks: Ranks, problem: Problem, deadline: Deadline | None = None) -> StabilizationLP:
     """Return the LP of the own cells of C; collective.
 
-    Its ``cell_status`` is that of the own free cells.
+    Its ``cell_status`` is that of the own part of the box: from the first own free cell to that of
+    the next rank.
     """
     deadline = Deadline.of(deadline)
     problem = ranks.agreed(lambda: settled(problem, deadline))
@@ -46,7 +47,7 @@ def compiled(ranks: Ranks, problem: Problem, deadline: Deadline | None = None) -
         problem=problem,
         partition=partition,
         controls=control_vectors(problem),
-        cell_status=_statuses(found, pairs.pair_pointer),
+        cell_status=_statuses(pairs, found),
         cells=cells,
         pair_pointer=np.append(0, np.cumsum(per_cell)).astype(np.int64),
         control=pairs.control[kept],
@@ -80,12 +81,18 @@ def _restricted(pairs: OwnPairs, found: Stabilizable) -> tuple[Mesh, Indices, Ro
     return mesh, np.flatnonzero(found.surviving), kept
 
 
-def _statuses(found: Stabilizable, pair_pointer: Indices) -> Statuses:
-    """Return the status code of every own free cell, as of one process."""
-    status = np.full(len(found.level), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
-    status[~found.reaches] = CellStatus.TRAPPED
-    status[np.diff(pair_pointer) == 0] = CellStatus.ESCAPES
-    status[found.inside[: len(status)]] = CellStatus.STABILIZED
+def _statuses(pairs: OwnPairs, found: Stabilizable) -> Statuses:
+    """Return the status code of every cell of the own part of the box, as of one process."""
+    code = np.full(len(found.level), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
+    code[~found.reaches] = CellStatus.TRAPPED
+    code[np.diff(pairs.pair_pointer) == 0] = CellStatus.ESCAPES
+    code[found.inside[: len(code)]] = CellStatus.STABILIZED
+    sets, rank, starts = pairs.sets, pairs.mesh.ranks.rank, pairs.mesh.division.starts
+    begins = np.append(sets.free, len(sets.number))  # of the free cells, and the end of the box
+    first, last = int(begins[starts[rank]]) if rank else 0, int(begins[starts[rank + 1]])
+    status = np.full(last - first, CellStatus.AVOID, dtype=np.uint8)
+    status[sets.attractor[first:last]] = CellStatus.ATTRACTOR
+    status[sets.free[starts[rank] : starts[rank + 1]] - first] = code
     return status
 
 

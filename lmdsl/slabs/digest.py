@@ -55,9 +55,9 @@ def digest(ranks: Ranks, division: Division, header: bytes, streams: Sequence[By
 def of_model(ranks: Ranks, lp: StabilizationLP) -> str:
     """Return the digest of a model, whole or spread over ranks; collective.
 
-    Its blocks hold, of every cell of C: its index in the box, the pairs with their controls and
-    costs, their rows with targets among the cells of C, and its weight. The header holds what every
-    rank has: gamma, the meaning of codes, the controls.
+    Its blocks hold the status of every cell of the box; then, of every cell of C, its index in the
+    box, the pairs with their controls and costs, their rows with targets among the cells of C, and
+    its weight. The header holds what every rank has: gamma, the meaning of codes, the controls.
     """
     rows, shares, mesh = lp.rows, lp.rows.shares, lp.mesh
     division = mesh.division if mesh else Division.cut(np.ones(lp.n, dtype=np.int64), 1)
@@ -66,6 +66,9 @@ def of_model(ranks: Ranks, lp: StabilizationLP) -> str:
     header = hashlib.sha256(repr((below, [*shares.numerator])).encode()).digest()
     header += np.array([lp.gamma], dtype="<f8").tobytes()
     header += hashlib.sha256(np.ascontiguousarray(lp.controls, dtype="<f8").tobytes()).digest()
+    counts = ranks.collect(len(lp.cell_status))
+    box = Division(np.append(0, np.cumsum(counts)), np.arange(len(counts) + 1))
+    header += digest(ranks, box, b"", [ByCell(lp.cell_status, "<u1")]).encode()
     entries = rows.pointer[lp.pair_pointer]
     return digest(ranks, division, header, (
         ByCell(lp.cells, "<i8"),

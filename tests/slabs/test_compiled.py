@@ -84,9 +84,7 @@ def compared(problem, counts, monkeypatch):
 
         def program(ranks):
             own = compiling.compiled(ranks, problem)
-            free = np.concatenate(ranks.collect(own.cell_status))
-            status = lp.cell_status.copy()
-            status[(status != 0) & (status != 5)] = free
+            status = np.concatenate(ranks.collect(own.cell_status))
             return joined(ranks, own), of_model(ranks, own), status.tolist()
 
         assert as_threads(count, program) == [expected] * count
@@ -144,7 +142,9 @@ def test_more_ranks_than_cells(monkeypatch):
 # Negative controls: what a model holds, its digest tells.
 
 
-@pytest.mark.parametrize("what", ["cells", "control", "cost", "weight", "target", "code", "pairs"])
+@pytest.mark.parametrize(
+    "what", ["status", "gamma", "cells", "control", "cost", "weight", "target", "code", "pairs"]
+)
 def test_the_digest_tells_every_change(what):
     lp = lm.compile(without_enclosures(1))
     rows, k = lp.rows, lp.K // 2
@@ -156,6 +156,8 @@ def test_the_digest_tells_every_change(what):
         return array
 
     other = {
+        "status": lambda: replace(lp, cell_status=changed(lp.cell_status, 0)),
+        "gamma": lambda: replace(lp, gamma=np.nextafter(lp.gamma, 2.0)),
         "cells": lambda: replace(lp, cells=changed(lp.cells, -1)),
         "control": lambda: replace(lp, control=changed(lp.control, k)),
         "cost": lambda: replace(lp, cost=np.nextafter(lp.cost, np.inf)),
