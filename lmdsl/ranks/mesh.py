@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.types import Indices
+from lmdsl.machine.kernels import kernel
 from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.verbs import RankError, Ranks
 
@@ -100,9 +101,9 @@ class Mesh:
         """
         division.confirm(ranks)
         first, last = division.own(ranks.rank)
-        cells = np.unique(np.asarray(named, dtype=np.int64))
-        ghosts = cells[((cells < first) | (cells >= last)) & (cells < division.cells)]
-        wrong = len(ghosts) and ghosts[0] < 0
+        ghosts = np.unique(named[(named < first) | (named >= last)]).astype(np.int64)
+        wrong = len(ghosts) and not (ghosts[0] >= 0 and ghosts[-1] <= division.cells)
+        ghosts = ghosts[ghosts != division.cells]
         if ranks.any(bool(wrong)):
             raise RankError(f"rows of a rank name cells outside 0..{division.cells - 1}")
         mesh = cls(ranks, division, ghosts)
@@ -129,14 +130,11 @@ class Mesh:
     def local(self, cells: NDArray[np.integer]) -> NDArray[np.int32]:
         """Return the local numbers of cells given by global ones; each is looked up and back."""
         first, last = self.division.own(self.ranks.rank)
-        cells = np.asarray(cells, dtype=np.int64)
-        found = np.searchsorted(self.ghosts, cells) + (last - first)
-        inside = (cells >= first) & (cells < last)
-        found = np.where(inside, cells - first, found)
-        found = np.where(cells == self.division.cells, self.columns, found)
-        if not (self.numbers[np.minimum(found, self.columns)] == cells).all():
+        found = np.empty(len(cells), dtype=np.int32)
+        known = _localise(np.asarray(cells), first, last, self.ghosts, self.division.cells, found)
+        if not known:
             raise RankError(f"rank {self.ranks.rank} has no ghost for a cell that its rows name")
-        return found.astype(np.int32)
+        return found
 
     def plan(self, chosen: NDArray[np.integer]) -> Halo:
         """Return the plan of some ghosts, by their places among all, and confirm it; collective.
@@ -222,6 +220,30 @@ class Mesh:
         x[self.own : self.columns] = _nothing(own.dtype)
         (halo or self.halo).fill(x)
         return x
+
+
+@kernel
+def _localise(cells, first, last, ghosts, end, found):  # type: ignore[no-untyped-def]
+    """Write local numbers; False where a cell is not own, no ghost and not the attractor."""
+    own = last - first
+    for e in range(len(cells)):
+        cell = cells[e]
+        if first <= cell < last:
+            found[e] = cell - first
+        elif cell == end:
+            found[e] = own + len(ghosts)
+        else:
+            low, high = 0, len(ghosts)
+            while low < high:
+                middle = (low + high) // 2
+                if ghosts[middle] < cell:
+                    low = middle + 1
+                else:
+                    high = middle
+            if low == len(ghosts) or ghosts[low] != cell:
+                return False
+            found[e] = own + low
+    return True
 
 
 def _nothing(kind: np.dtype[Any]) -> Any:

@@ -56,14 +56,16 @@ def compiled(ranks: Ranks, problem: Problem, deadline: Deadline | None = None) -
         gamma=problem.gamma,
         weight=_weight(ranks, pairs.sets, cells),
         mesh=mesh,
-        _known=(level, np.searchsorted(kept, pair)),
+        _known=(level, pair if isinstance(kept, slice) else np.searchsorted(kept, pair)),
     )
 
 
-def _restricted(pairs: OwnPairs, found: Stabilizable) -> tuple[Mesh, Indices, Rows]:
+def _restricted(pairs: OwnPairs, found: Stabilizable) -> tuple[Mesh, Indices | slice, Rows]:
     """Return the mesh of C, the pairs that survive, and their rows in its local numbers."""
     before, rows = pairs.mesh, pairs.rows
     inside = found.inside[: before.own]
+    if before.ranks.all(bool(inside.all() and found.surviving.all())):
+        return before, slice(None), rows
     division = before.division.within(before.ranks, inside)
     number = np.full(before.own, -1, dtype=np.int64)
     number[inside] = division.own(before.ranks.rank)[0] + np.arange(inside.sum())
@@ -73,9 +75,11 @@ def _restricted(pairs: OwnPairs, found: Stabilizable) -> tuple[Mesh, Indices, Ro
     target, code = np.empty(entries, dtype=np.int32), np.empty(entries, dtype=rows.code.dtype)
     same = np.arange(before.columns + 1, dtype=np.int32)
     _keep(found.surviving, rows.pointer, rows.target, rows.code, same, target, code)
-    mesh = Mesh.of(before.ranks, division, numbers[np.unique(target)])
+    used = np.zeros(before.columns + 1, dtype=np.bool_)
+    used[target] = True
+    named = np.flatnonzero(used)
+    mesh = Mesh.of(before.ranks, division, numbers[named])
     local = np.full(before.columns + 1, -1, dtype=np.int32)
-    named = np.unique(target)
     local[named] = mesh.local(numbers[named])
     kept = Rows(pointer, local[target], code, rows.shares, mesh.columns)
     return mesh, np.flatnonzero(found.surviving), kept
