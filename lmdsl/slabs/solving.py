@@ -87,7 +87,8 @@ def _iterated(
 ) -> tuple[Policy, Floats, Screen, int]:
     """Improve a policy until no control is better; return the last, its value, and the steps.
 
-    As :func:`lmdsl.optimize.policies.iteration.iterate`, each policy evaluated to the end.
+    As :func:`lmdsl.optimize.policies.iteration.iterate`: while policies change a lower V >= T_u V
+    will do; only one evaluated to the end is returned.
     """
     lp, ranks = first.lp, first.mesh.ranks
     screen, steps = Screen(lp), 0
@@ -98,17 +99,20 @@ def _iterated(
         if last is not None and (not changed or time_up()):
             return *last, screen, steps
         steps += changed > 0
-        try:
-            exact = by.value(done.policy, done.value)
-        except Stopped:  # on all ranks
-            return *(last or (policy, V)), screen, steps
-        _require_fallen(first, V, exact)
-        if last is not None and not ranks.any(bool((exact < last[1]).any())):
-            return *last, screen, steps  # rounding made a change look better than it is
-        ratio = min(ranks.collect(_least_ratio(V, np.minimum(exact, V))))
+        lower = by.lower(done.policy, done.value) if changed and not time_up() else None
+        before, last = last, None
+        if lower is None:
+            try:
+                lower = by.value(done.policy, done.value)
+            except Stopped:  # on all ranks
+                return *(before or (policy, V)), screen, steps
+            _require_fallen(first, V, lower)
+            if before is not None and not ranks.any(bool((lower < before[1]).any())):
+                return *before, screen, steps  # rounding made a change look better than it is
+            last = done.policy, lower
+        ratio = min(ranks.collect(_least_ratio(V, np.minimum(lower, V))))
         screen.follow(np.ones(1), np.array([ratio]))
-        policy, V = done.policy, exact
-        last = policy, V
+        policy, V = done.policy, lower
 
 
 def _require_fallen(first: First, before: Floats, after: Floats) -> None:

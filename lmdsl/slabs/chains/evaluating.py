@@ -25,6 +25,7 @@ from lmdsl.slabs.chains import peeling
 from lmdsl.slabs.chains.first import First
 
 MOST_GATHERED = 10**6  # cells up to which rank 0 evaluates
+FEW = 12  # sweeps of a core by which a value is lowered between two passes
 
 
 class Evaluator(Protocol):
@@ -32,6 +33,9 @@ class Evaluator(Protocol):
 
     def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
         """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
+
+    def lower(self, policy: Policy, V: Floats) -> Floats | None:
+        """Return a lower V >= T_u V for V >= T_u V; None where the value is as soon known."""
 
     def value(self, policy: Policy, start: Floats) -> Floats:
         """Return the value of a g-stabilizing policy."""
@@ -45,6 +49,10 @@ class ByFirst:
     """Rank 0 evaluates."""
 
     first: First
+
+    def lower(self, policy: Policy, V: Floats) -> Floats | None:
+        """Return None."""
+        return None
 
     def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
         """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
@@ -156,6 +164,12 @@ class ByAll:
             own = float((self.lp.cost[policy] / d).max(initial=0.0))
             V = w * (max(self.mesh.ranks.collect(own)) * (1 + 1e-12))
         return None if self.mesh.ranks.any(not (V < CEILING).all()) else V
+
+    def lower(self, policy: Policy, V: Floats) -> Floats | None:
+        """Return V after a few sweeps of the core, exact outside."""
+        x = V.copy()
+        chain = self.chain(policy, self.lp.gamma)
+        return np.minimum(x, V) if chain.advance(self.lp.cost[policy], x, FEW, 0.0) < np.inf else V
 
     def value(self, policy: Policy, start: Floats) -> Floats:
         """Return the value of a g-stabilizing policy."""

@@ -22,7 +22,7 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, SplitMatrix
 from lmdsl.optimize.linear.policy_system import of_policy
 from lmdsl.ranks.mesh import Mesh
-from lmdsl.ranks.reading import added
+from lmdsl.ranks.verbs import RankError
 from lmdsl.slabs.chains.sweeping import SpreadSystem
 
 
@@ -153,11 +153,26 @@ def _outside(whole: SpreadSystem) -> NDArray[np.uint32]:
 
 
 def _told(mesh: Mesh, ways: Indices) -> Indices:
-    """Return the numbers of own cells with what other ranks have to add to them."""
-    ghosts = np.flatnonzero(ways[mesh.own :])
-    own = ways[: mesh.own].astype(np.float64)  # whole numbers below 2^53
-    more = ways[mesh.own :][ghosts].astype(np.float64)
-    return added(mesh.ranks, mesh.division, mesh.ghosts[ghosts], more, own).astype(np.int64)
+    """Return the numbers of own cells with what other ranks have to add to them; collective."""
+    own, named = ways[: mesh.own].copy(), np.flatnonzero(ways[mesh.own :])
+    cells, more = mesh.ghosts[named], ways[mesh.own + named]
+    owner = mesh.division.owner(cells)
+    parcels = {
+        int(k): np.concatenate(
+            [(cells - mesh.division.starts[k])[owner == k], more[owner == k]],
+            dtype=np.int32,
+            casting="same_kind",
+        )
+        for k in np.unique(owner)
+    }
+    for other, came in mesh.ranks.exchange(parcels).items():
+        at, ways_there = np.split(came, 2)
+        if len(at) and not (at.min() >= 0 and at.max() < len(own)):
+            raise RankError(
+                f"rank {other} counts ways to cells that rank {mesh.ranks.rank} has not"
+            )
+        np.add.at(own, at, ways_there)
+    return own
 
 
 def _among(
