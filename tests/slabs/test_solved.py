@@ -21,8 +21,8 @@ from lmdsl.slabs import compiling, judging, refusing, solving
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MAP = str(EXAMPLES / "standard_map.json")
-# Verified: at gamma above and below 1, with noise, zeros in the cost, lost cells, ties.
-SEEDS = [0, 1, 3, 5, 6, 13]
+# Verified: at gamma above 1 and near gamma_bar, with noise, zeros in the cost, ties.
+SEEDS = [0, 1, 3, 5, 6, 13, 25]
 
 
 def require_equal(one, found):

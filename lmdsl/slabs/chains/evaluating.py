@@ -202,3 +202,10 @@ class ByAll:
                 break
             V = V + share * 1.01 * w
         return V
+
+
+def evaluator(lp: StabilizationLP, gathered: int, time_up: TimeUp) -> Evaluator:
+    """Return who evaluates: rank 0 up to so many cells, else all."""
+    assert lp.mesh is not None
+    small = lp.mesh.division.cells <= gathered
+    return ByFirst(First(lp)) if small else ByAll(lp, time_up)

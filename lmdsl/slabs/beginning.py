@@ -1,0 +1,68 @@
+"""A first policy over ranks: one that is proved to be g-stabilizing."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from lmdsl.common.types import Floats, Policy, TimeUp
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.feasibility import first_policy
+from lmdsl.optimize.policies import bellman
+from lmdsl.slabs.chains.evaluating import Evaluator, evaluator
+from lmdsl.slabs.chains.first import First
+from lmdsl.slabs.iterating import iterated
+
+ROUNDS = 50  # times that gamma is raised
+NEAREST = 1e-9  # relative distance up to which it is raised towards the gamma asked for
+
+
+def soon(first: First, by: Evaluator) -> tuple[Policy, Floats] | None:
+    """Return a g-stabilizing policy and V >= T_u V: greedy in a few passes, or Algorithm 1's."""
+    lp, ranks = first.lp, first.mesh.ranks
+    level, tree = lp._algorithm_1
+    V = level.astype(np.float64)
+    few = max(ranks.collect(int(level.max(initial=0)))) <= first_policy.NEAR
+    for k in range(4 if few else 0):
+        better = bellman.rise(lp, V, lp.growth, k % 2 == 1)
+        V = better.value
+        found = by.bound(better.policy, V) if k in (0, 3) else None
+        if found is not None:
+            return better.policy, found
+    found = by.bound(tree, None)
+    return None if found is None else (tree, found)
+
+
+def raised(
+    lp: StabilizationLP, by: Evaluator, gathered: int, time_up: TimeUp
+) -> tuple[Policy, Floats] | None:
+    """Return the same by raising gamma in steps, as :func:`first_policy.stabilizing` does.
+
+    From gamma = 1 - 1/h, at which no policy costs more than h under unit cost, each step goes as
+    far towards g as the optimal policy of the last one allows. Collective.
+    """
+    ranks = First(lp).mesh.ranks
+    level, policy = lp._algorithm_1
+    horizon = 64.0 * max(ranks.collect(int(level.max(initial=0))))
+    at, V = 1 - 1 / horizon, np.full(lp.n, horizon)
+    for _ in range(ROUNDS):
+        unit = _unit(lp, at)
+        policy, V, _, _ = iterated(First(unit), evaluator(unit, gathered, time_up), policy, V,
+                                   time_up)  # fmt: skip
+        found = by.bound(policy, V)
+        if found is not None:
+            return policy, found
+        if time_up():
+            return None
+        reach, higher = lp.growth, None
+        while higher is None and reach > at * (1 + NEAREST):
+            reach = at + (reach - at) / 2
+            higher = evaluator(_unit(lp, reach), gathered, time_up).bound(policy, V)
+        if higher is None:
+            return None
+        at, V = reach, higher
+    return None
+
+
+def _unit(lp: StabilizationLP, gamma: float) -> StabilizationLP:
+    """Return the model under unit cost and another gamma."""
+    return replace(lp, gamma=gamma, cost=np.ones(lp.K), _known=lp._algorithm_1)
