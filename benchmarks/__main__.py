@@ -7,11 +7,11 @@ import signal
 import sys
 from pathlib import Path
 
-from benchmarks import models, rivals, targets
+from benchmarks import models, ranks, rivals, targets
 from benchmarks.measure import Rules
 from benchmarks.run import Run
 
-SUITES = ("targets", "rivals", "micro", "scaling")
+SUITES = ("targets", "rivals", "micro", "scaling", "ranks")
 
 
 def main() -> int:
@@ -31,6 +31,10 @@ def main() -> int:
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # end the contestants, too
     run = Run(options.out, rules, contestants, log=lambda text: print(text, flush=True))
     suites = SUITES if options.suite == "all" else (options.suite,)
+    if "ranks" in suites and not options.smoke:
+        sizes = ranks.QUICK if options.quick else ranks.SIZES
+        ranks.measure(run, _whole(options.cells, sizes), _whole(options.ranks, ranks.COUNTS),
+                      options.by_all)  # fmt: skip
     if options.smoke:
         _smoke(run, names or list(models.SMOKE))
     else:
@@ -38,6 +42,10 @@ def main() -> int:
     run.save()
     print(f"written to {options.out / 'results.md'} and {options.out / 'results.json'}")
     return 0
+
+
+def _whole(text: str | None, default: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(map(int, text.split(","))) if text else default
 
 
 def _full(run: Run, suites: tuple[str, ...], names: list[str] | None, largest: int) -> None:
@@ -78,6 +86,10 @@ def _options() -> argparse.Namespace:
     parser.add_argument(
         "--largest", type=int, default=3162, help="most cells an axis in scaling and targets"
     )
+    parser.add_argument("--cells", metavar="N,...", help="cells an axis in ranks")
+    parser.add_argument("--ranks", metavar="R,...", help="numbers of ranks in ranks")
+    parser.add_argument("--by-all", action="store_true", help="in ranks: all evaluate policies")
+    parser.add_argument("--quick", action="store_true", help="in ranks: one small size")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--smoke", action="store_true", help="tiny models, once, under a minute")
     return parser.parse_args()

@@ -19,6 +19,10 @@ from lmdsl.optimize import witness
 from lmdsl.optimize.linear.policy_system import of_policy
 from lmdsl.optimize.policies import bellman
 from lmdsl.optimize.policies.evaluation import evaluate
+from lmdsl.ranks import mpi
+from lmdsl.ranks.verbs import Ranks
+from lmdsl.slabs import compiling, solving
+from lmdsl.slabs.chains.evaluating import MOST_GATHERED
 
 
 def transitions(lp: lm.StabilizationLP) -> tuple[Any, Any, Any]:
@@ -74,6 +78,46 @@ def estimates() -> Iterator[list[int]]:
         yield seen
     finally:
         memory.require = require
+
+
+def this_rank() -> Ranks:
+    """Return this rank, alone where no launcher started several."""
+    return mpi.at_hand()
+
+
+def over_ranks(
+    ranks: Ranks, problem: lm.Problem, mark: Callable[[str], None], everybody: bool
+) -> dict[str, Any]:
+    """Compile, solve and verify a problem over ranks; ``mark`` is told what begins.
+
+    Policies are evaluated by all ranks where ``everybody`` says so, whatever their size.
+    """
+    lp = compiling.compiled(ranks, problem)
+    mark("solve")
+    with _told_before_verification(mark):
+        found = solving.solved(lp, gathered=0 if everybody else MOST_GATHERED)
+    if found is None:
+        return {"cells": lp.n, "status": "undecided", "cost": None}
+    proof = found.certificate
+    word = "verified" if proof.verified else "unverified"
+    return {"cells": lp.n, "status": word, "cost": proof.cost}
+
+
+@contextlib.contextmanager
+def _told_before_verification(mark: Callable[[str], None]) -> Iterator[None]:
+    """Tell that vectors are made, once ties are broken, which is the end of solving."""
+    broken = solving._ties_broken
+
+    def told(*arguments: Any) -> Any:
+        found = broken(*arguments)
+        mark("verify")
+        return found
+
+    solving._ties_broken = told
+    try:
+        yield
+    finally:
+        solving._ties_broken = broken
 
 
 def random_lp(n: int, M: int, spread: int, samples: int) -> lm.StabilizationLP:

@@ -41,6 +41,7 @@ class Run:
     micro: dict[str, dict[str, Any]] = field(default_factory=dict)
     pipelines: dict[str, dict[str, Any]] = field(default_factory=dict)
     targets: list[dict[str, Any]] = field(default_factory=list)
+    over_ranks: list[dict[str, Any]] = field(default_factory=list)
     exceeded: dict[tuple[str, str, float], str] = field(default_factory=dict)
 
     def group(
@@ -134,6 +135,7 @@ class Run:
             "groups": list(self.groups.values()),
             "micro": list(self.micro.values()),
             "pipelines": list(self.pipelines.values()),
+            "over_ranks": self.over_ranks,
         }
 
     def save(self) -> None:
