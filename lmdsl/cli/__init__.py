@@ -18,11 +18,17 @@ from lmdsl.cli.output import Arguments, Run, narrated, print_json
 from lmdsl.cli.streams import kept
 from lmdsl.errors import LmdslError, printable, shown
 from lmdsl.machine.deadline import TimeLimitReached
+from lmdsl.ranks.launchers import launched
 from lmdsl.results.status import Status
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
+    under = launched()
+    if under.count > 1:
+        from lmdsl.cli import ranks
+
+        return ranks.main(arguments, under)
     with kept() as answers:
         try:
             with contextlib.redirect_stdout(answers):  # for --help

@@ -4,7 +4,6 @@ Nothing here is imported unless the program was started by a launcher. Messages 
 lie in memory; what is small and of any kind is pickled: it comes from the same program.
 """
 
-import os
 import sys
 from typing import Any
 
@@ -12,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.errors import MissingDependency
+from lmdsl.ranks.launchers import launched
 from lmdsl.ranks.verbs import Alone, Item, RankError, Ranks, require_expected
 
-# Environment variables of which a launcher sets one: the number of ranks.
-LAUNCHED = ("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", "PMIX_SIZE", "MPI_LOCALNRANKS")
 TAG, TROUBLE = 7, 8  # of messages between two ranks, and of those that one has failed
 KINDS = "?bhilqBHILQfd"  # types of arrays, by NumPy's character
 
@@ -112,14 +110,6 @@ def as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:
     return array.view(np.uint8)
 
 
-def launched() -> int:
-    """Return how many ranks a launcher started; 1 where none did."""
-    for name in LAUNCHED:
-        if os.environ.get(name, "").isdecimal():
-            return int(os.environ[name])
-    return 1
-
-
 def at_hand() -> Ranks:
     """Return this rank: alone where no launcher started several.
 
@@ -128,7 +118,7 @@ def at_hand() -> Ranks:
     MissingDependency
         A launcher started several, and mpi4py is not installed: each would do all the work.
     """
-    count = launched()
+    count, _, exact = launched()
     if count <= 1:
         return Alone()
     try:
@@ -139,9 +129,10 @@ def at_hand() -> Ranks:
             "would do all the work; pip install 'lmdsl[mpi]', or start one process"
         ) from None
     found = MpiRanks(MPI.COMM_WORLD)
-    if found.count != count:
+    if found.count < count or (exact and found.count != count):
         raise MissingDependency(
-            f"the launcher started {count} ranks, and MPI sees {found.count}: mpi4py and mpiexec "
-            "are of different MPIs; use the mpiexec that belongs to mpi4py's"
+            f"the launcher started {count} ranks, and MPI sees {found.count}: mpi4py and the "
+            "launcher are of different MPIs; use the mpiexec that belongs to mpi4py's (of Slurm, "
+            "srun --mpi=pmi2 or pmix)"
         )
     return found

@@ -12,7 +12,7 @@ from rank_programs import PROGRAMS
 
 from lmdsl.errors import BadInput, MissingDependency
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
-from lmdsl.ranks import mpi
+from lmdsl.ranks import launchers, mpi
 from lmdsl.ranks.threaded import as_threads
 from lmdsl.ranks.verbs import Alone, RankError, Traffic
 from lmdsl.ranks.watching import Watched
@@ -235,9 +235,42 @@ def test_traffic_is_counted():
     assert as_threads(2, program) == [Traffic(calls=2, sent=32)] * 2
 
 
+def alone(monkeypatch, **variables):
+    for names in (*launchers.LAUNCHED, *launchers.LOCAL):
+        for name in (*names[:2], *names[2]):
+            monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+
+
+@pytest.mark.parametrize(
+    ("variables", "found"),
+    [
+        ({}, (1, 0, True)),
+        ({"PMI_SIZE": "3", "PMI_RANK": "2", "MPI_LOCALNRANKS": "2"}, (3, 2, True)),
+        ({"OMPI_COMM_WORLD_SIZE": "2", "OMPI_COMM_WORLD_RANK": "1"}, (2, 1, True)),
+        ({"MPI_LOCALNRANKS": "2"}, (2, 0, False)),
+        ({"PALS_LOCAL_SIZE": "4", "PALS_RANKID": "9"}, (4, 9, False)),
+        ({"FLUX_JOB_SIZE": "4", "FLUX_TASK_RANK": "3"}, (4, 3, True)),
+        # of an instance of Flux, whose first program is one process
+        ({"FLUX_JOB_SIZE": "4"}, (1, 0, True)),
+        ({"SLURM_STEP_NUM_TASKS": "2", "SLURM_PROCID": "1", "SLURM_STEP_ID": "0"}, (2, 1, True)),
+        # sbatch -n 8, a script of it, salloc -n 8, and an interactive step: one process each
+        ({"SLURM_NTASKS": "8"}, (1, 0, True)),
+        ({"SLURM_NTASKS": "8", "SLURM_PROCID": "0"}, (1, 0, True)),
+        ({"SLURM_STEP_NUM_TASKS": "8", "SLURM_PROCID": "0"}, (1, 0, True)),
+        ({"SLURM_STEP_NUM_TASKS": "8", "SLURM_PROCID": "0", "SLURM_STEP_ID": "4294967290"},
+         (1, 0, True)),
+        ({"PMI_SIZE": "many"}, (1, 0, True)),
+    ],
+)  # fmt: skip
+def test_what_launchers_say(monkeypatch, variables, found):
+    alone(monkeypatch, **variables)
+    assert launchers.launched() == found
+
+
 def test_a_launcher_without_mpi4py_is_refused(monkeypatch):
-    for name in mpi.LAUNCHED:
-        monkeypatch.delenv(name, raising=False)
+    alone(monkeypatch)
     assert isinstance(mpi.at_hand(), Alone)
     monkeypatch.setenv("PMI_SIZE", "1")
     assert isinstance(mpi.at_hand(), Alone)
