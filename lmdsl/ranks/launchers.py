@@ -2,7 +2,7 @@
 
 A process that is alone must never be taken for one of many, nor many for one. So a variable counts
 only where the launcher sets it for the ranks that it starts: ``sbatch`` and ``salloc``, say, set
-``SLURM_NTASKS`` for a script that is one process; ``srun`` sets the number of tasks of its own step.
+``SLURM_NTASKS`` for a script that is one process; ``srun`` sets the number of tasks of its step.
 """
 
 import os
