@@ -25,7 +25,7 @@ from lmdsl.results.status import Status
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit status."""
     under = launched()
-    if under.count > 1:
+    if under.ranks > 1:
         from lmdsl.cli import ranks
 
         return ranks.main(arguments, under)

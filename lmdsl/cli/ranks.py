@@ -10,7 +10,7 @@ def main(arguments: Sequence[str] | None, launched: Launched) -> int:
     """Run the command line on this rank and return its exit status."""
     if launched.rank == 0:
         print(
-            f"lmdsl: a launcher started {launched.count} ranks, each of which would do all the "
+            f"lmdsl: a launcher started {launched.ranks} ranks, each of which would do all the "
             "work; start one process",
             file=sys.stderr,
         )

@@ -29,7 +29,7 @@ NO_STEP = (
 class Launched(NamedTuple):
     """What a launcher says; of a process that none started: 1 rank, this one."""
 
-    count: int = 1  # number of ranks
+    ranks: int = 1  # how many
     rank: int = 0  # which one this is
     exact: bool = True  # whether there are no others, on other machines
 
