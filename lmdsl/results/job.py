@@ -3,7 +3,7 @@
 import time
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,12 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.sets import attractor_note
-from lmdsl.model.stabilizable_set import CellStatus, sets_of
+from lmdsl.model.stabilizable_set import LOST, CellStatus, sets_of
 from lmdsl.problem.problem import Problem
 from lmdsl.results.polishing import _Outcome
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
-from lmdsl.results.summary import Coverage, Seconds
+from lmdsl.results.summary import Seconds
 from lmdsl.systems import DataSystem
 
 UNKNOWN = 255  # status of cells of which nothing is known
@@ -62,6 +62,103 @@ def not_compiled(
         witness=np.zeros(N),
         control_vectors=control_vectors(problem),
     )
+
+
+class Extent(NamedTuple):
+    """How many cells of a compiled model are what.
+
+    Attributes
+    ----------
+    inside
+        Number of cells of C.
+    status
+        Number of cells by :class:`CellStatus`.
+    weighed, held
+        Whether a cell of C carries weight; whether some cell holds, where that is asked for.
+    """
+
+    inside: int
+    status: tuple[int, ...]
+    weighed: bool
+    held: bool
+
+    @classmethod
+    def of(cls, lp: StabilizationLP) -> Self:
+        """Count the cells of a model."""
+        status = np.bincount(lp.cell_status, minlength=len(CellStatus)).tolist()
+        return cls(lp.n, tuple(status), bool(lp.weight.any()), not holding.none_holds(lp.hold))
+
+    @property
+    def free(self) -> int:
+        """Number of cells that are neither attractor nor avoid."""
+        given = self.status[CellStatus.ATTRACTOR] + self.status[CellStatus.AVOID]
+        return sum(self.status) - given
+
+
+def ruled_out(
+    problem: Problem, partition: Partition, extent: Extent, require_all: bool, deadline: Deadline
+) -> tuple[Cause, str] | None:
+    """Return the cause and a sentence where the graph alone rules the problem out."""
+    if not extent.held:
+        return Cause.HOLD, holding.why_none(problem, partition, deadline)
+    if not extent.inside:
+        enclosed = problem.successors == "enclosed"
+        if not any(extent.status[lost] for lost in LOST):
+            return Cause.EMPTY, "every cell is attractor or avoid; there is nothing to stabilize"
+        if problem.attractor.empty:
+            return Cause.EMPTY, _nothing_to_end_in(problem)
+        sentence = "no cell can be kept in the box and brought to the attractor"
+        return Cause.EMPTY, sentence + enclosed * (
+            ", as far as enclosures of whole cells show; smaller cells or a finer control grid may "
+            "do it (lmdsl explain)"
+        )
+    if not extent.weighed:
+        return Cause.MEASURE, "no cell of measure is stabilizable; enlarge its boxes"
+    outside = extent.free - extent.inside
+    if require_all and outside:
+        return (
+            Cause.REQUIRE_ALL, f"{outside} of {extent.free} free cells are not stabilizable",
+        )  # fmt: skip
+    return None
+
+
+def _nothing_to_end_in(problem: Problem) -> str:
+    if problem.ends_in_time:
+        return "discounted, no target: no cell can be kept in the box"
+    return (
+        f"gamma = {problem.gamma!r} times the discount {problem.discount!r} is not below 1, and "
+        "there is no attractor: lower one of them, or declare an attractor"
+    )
+
+
+def success(problem: Problem, extent: Extent, gap: float | None) -> str:
+    """Return what a verified controller does."""
+    n, free = extent.inside, extent.free
+    cells = f"every one of {n} cells (of {free} free)"
+    text = f"the controller brings {cells} to the attractor"
+    if n < LITTLE * free and not problem.ends_in_time:
+        text = (
+            f"only {n} of {free} free cells can be stabilized: the controller brings every "
+            "one of these to the attractor"
+        )
+    elif problem.attractor.empty:
+        text = f"discounted, no target: the controller keeps {cells} among them"
+    elif problem.ends_in_time:
+        text = f"the controller runs from {cells} to the attractor or the discounted end"
+    return f"{text}; its cost is within {gap:.2g} of optimal (finite model)"
+
+
+def neither_way(gamma: float) -> str:
+    """Return why it is not decided whether a gamma is feasible."""
+    return (
+        f"gamma = {gamma!r} is so close to its limit, or the way to the attractor so long, that "
+        "the numbers decide neither way"
+    )
+
+
+def left_out(count: int) -> str:
+    """Return how many cells a gamma leaves out."""
+    return f"{count} cells are proved infeasible at this gamma"
 
 
 class _Job:
@@ -104,7 +201,7 @@ class _Job:
             inner,
             witness=inner.witness + w,
             seconds=replace(inner.seconds, compile=self.compile_seconds),
-            message=f"{inner.message}; {count} cells are proved infeasible at this gamma",
+            message=f"{inner.message}; {left_out(count)}",
         )
 
     def solved(
@@ -113,9 +210,7 @@ class _Job:
         proof = verified.certificate
         if proof.verified:
             status = Status.VERIFIED
-            message = (
-                f"{self._success()}; its cost is within {proof.gap:.2g} of optimal (finite model)"
-            )
+            message = success(self.lp.problem, Extent.of(self.lp), proof.gap)
         else:
             failed = not solution.stop.success and not undecided
             status = Status.SOLVER_FAILED if failed else Status.UNVERIFIED
@@ -123,10 +218,7 @@ class _Job:
             if failed:
                 message = f"{solution.stop.value} ({solution.word}); {message}"
             elif undecided:
-                message = (
-                    f"gamma = {self.lp.gamma!r} is so close to its limit, or the way to the "
-                    f"attractor so long, that the numbers decide neither way; {message}"
-                )
+                message = f"{neither_way(self.lp.gamma)}; {message}"
         return self._result(
             verified.witness,
             proof,
@@ -138,21 +230,6 @@ class _Job:
             iterations=solution.iterations,
             log=self.log,
         )
-
-    def _success(self) -> str:
-        """Return what a verified controller does."""
-        lp, free = self.lp, Coverage.of(self.lp.cell_status).free
-        cells = f"every one of {lp.n} cells (of {free} free)"
-        if lp.n < LITTLE * free and not lp.problem.ends_in_time:
-            return (
-                f"only {lp.n} of {free} free cells can be stabilized: the controller brings every "
-                "one of these to the attractor"
-            )
-        if lp.problem.attractor.empty:
-            return f"discounted, no target: the controller keeps {cells} among them"
-        if lp.problem.ends_in_time:
-            return f"the controller runs from {cells} to the attractor or the discounted end"
-        return f"the controller brings {cells} to the attractor"
 
     def _integration_error(self) -> IntegrationError | None:
         """Judge the compiled steps, where there is time."""
@@ -199,7 +276,7 @@ class _Job:
             stabilizable_cells=lp.n,
             local_controller=local,
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
-            message=_together(message, attractor_note(lp.problem, lp.partition), held, *said),
+            message=together(message, attractor_note(lp.problem, lp.partition), held, *said),
             data=data,
             integration_error=error,
             problem=lp.problem,
@@ -228,7 +305,8 @@ def _controls(lp: StabilizationLP, witness: Witness) -> NDArray[np.int32]:
     return index
 
 
-def _together(*notes: str) -> str:
+def together(*notes: str) -> str:
+    """Return the sentences that there are as one text."""
     return "; ".join(note for note in notes if note)
 
 

@@ -18,13 +18,11 @@ from lmdsl.common.types import FilePath, Progress, told
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP, compile
-from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility import first_policy, gamma_bar, lifting, restriction
 from lmdsl.optimize.witness import certify
 from lmdsl.problem import Problem, given
-from lmdsl.results.job import _Job, not_compiled
+from lmdsl.results.job import Extent, _Job, not_compiled, ruled_out
 from lmdsl.results.polishing import _Outcome, _polish
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause
@@ -170,7 +168,7 @@ def _answer(lp: StabilizationLP, request: _Request, compile_seconds: float | Non
     job.finish = deadline.again()
     if request.start is not None:
         request.start.require_fit(lp)
-    refused = _not_stabilizable(lp, request.require_all, job.finish)
+    refused = ruled_out(lp.problem, lp.partition, Extent.of(lp), request.require_all, job.finish)
     if refused:
         return job.refused(*refused)
     request.tell("solve")
@@ -264,44 +262,6 @@ def _no_enclosures(problem: Problem) -> None:
             'known on the smaller model; lower gamma, or use "successors": "sampled"',
             "restrict_to_gamma",
         )
-
-
-def _not_stabilizable(
-    lp: StabilizationLP, require_all: bool, deadline: Deadline
-) -> tuple[Cause, str] | None:
-    """Return the cause and a sentence where the graph alone rules the problem out."""
-    if holding.none_holds(lp.hold):
-        return Cause.HOLD, holding.why_none(lp.problem, lp.partition, deadline)
-    if not lp.n:
-        enclosed = lp.problem.successors == "enclosed"
-        if not np.isin(lp.cell_status, LOST).any():
-            return Cause.EMPTY, "every cell is attractor or avoid; there is nothing to stabilize"
-        if lp.problem.attractor.empty:
-            return Cause.EMPTY, _nothing_to_end_in(lp.problem)
-        sentence = "no cell can be kept in the box and brought to the attractor"
-        return Cause.EMPTY, sentence + enclosed * (
-            ", as far as enclosures of whole cells show; smaller cells or a finer control grid may "
-            "do it (lmdsl explain)"
-        )
-    if not lp.weight.any():
-        return Cause.MEASURE, "no cell of measure is stabilizable; enlarge its boxes"
-    given = np.isin(lp.cell_status, (CellStatus.ATTRACTOR, CellStatus.AVOID))
-    outside = lp.partition.size - lp.n - int(given.sum())
-    if require_all and outside:
-        return (
-            Cause.REQUIRE_ALL,
-            f"{outside} of {lp.n + outside} free cells are not stabilizable",
-        )
-    return None
-
-
-def _nothing_to_end_in(problem: Problem) -> str:
-    if problem.ends_in_time:
-        return "discounted, no target: no cell can be kept in the box"
-    return (
-        f"gamma = {problem.gamma!r} times the discount {problem.discount!r} is not below 1, and "
-        "there is no attractor: lower one of them, or declare an attractor"
-    )
 
 
 def _refuse(lp: StabilizationLP, found: first_policy.Refused, tolerance: float) -> Verified:

@@ -21,8 +21,8 @@ from lmdsl.model.stabilizable_set import CellStatus, Stabilizable, _ends, _keep
 from lmdsl.problem import Problem
 from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.verbs import Ranks
-from lmdsl.slabs import levels
-from lmdsl.slabs.pairs import OwnPairs, assembled
+from lmdsl.slabs.graph import levels
+from lmdsl.slabs.graph.pairs import OwnPairs, assembled
 
 
 def compiled(ranks: Ranks, problem: Problem, deadline: Deadline | None = None) -> StabilizationLP:

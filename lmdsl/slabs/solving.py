@@ -15,9 +15,10 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.policies import ties
 from lmdsl.optimize.policies.iteration import TIE
 from lmdsl.optimize.policies.screening import Screen
-from lmdsl.slabs import beginning, below, judging, refusing
+from lmdsl.slabs import beginning, below, judging
 from lmdsl.slabs.chains.evaluating import MOST_GATHERED, Evaluator, evaluator
 from lmdsl.slabs.chains.first import First
+from lmdsl.slabs.gamma import refusing
 from lmdsl.slabs.iterating import iterated
 
 

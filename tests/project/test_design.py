@@ -22,7 +22,8 @@ PACKAGE = Path(lm.__file__).parent
 PACKAGES = [
     "errors", "machine", "common", "ranks", "formulas", "systems", "problem", "model",
     "certificate", "optimize", "slabs", "backends", "data", "proof", "control", "results",
-    "explanation", "advice", "plotting", "report", "interop", "testing", "cli", "__main__",
+    "distributed", "explanation", "advice", "plotting", "report", "interop", "testing", "cli",
+    "__main__",
 ]  # fmt: skip
 
 # Imports against the order, inside functions: methods that only forward to a later package.

@@ -17,8 +17,9 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.ranks.threaded import as_threads
 from lmdsl.ranks.verbs import Alone, RankError
-from lmdsl.slabs import compiling, digest, levels
+from lmdsl.slabs import compiling, digest
 from lmdsl.slabs.digest import of_model
+from lmdsl.slabs.graph import levels
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 COUNTS = [1, 2, 3, 4, 7]

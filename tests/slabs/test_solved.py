@@ -17,7 +17,8 @@ from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.reading import Read, added, read
 from lmdsl.ranks.threaded import as_threads
 from lmdsl.ranks.verbs import RankError
-from lmdsl.slabs import compiling, judging, refusing, solving
+from lmdsl.slabs import compiling, judging, solving
+from lmdsl.slabs.gamma import refusing
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 MAP = str(EXAMPLES / "standard_map.json")

@@ -1,0 +1,1 @@
+"""The verbs over ranks, and what they return: facts that all share, arrays of own cells."""
