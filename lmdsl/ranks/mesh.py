@@ -100,11 +100,10 @@ class Mesh:
         Numbers of own cells, and of the attractor (``division.cells``), are passed over.
         """
         division.confirm(ranks)
-        first, last = division.own(ranks.rank)
-        ghosts = np.unique(named[(named < first) | (named >= last)]).astype(np.int64)
-        wrong = len(ghosts) and not (ghosts[0] >= 0 and ghosts[-1] <= division.cells)
-        ghosts = ghosts[ghosts != division.cells]
-        if ranks.any(bool(wrong)):
+        seen = np.zeros(division.cells // 8 + 1, dtype=np.uint8)  # a bit for each cell
+        known = bool(_see(np.asarray(named), *division.own(ranks.rank), division.cells, seen))
+        ghosts = _seen(seen)
+        if not ranks.all(known):
             raise RankError(f"rows of a rank name cells outside 0..{division.cells - 1}")
         mesh = cls(ranks, division, ghosts)
         mesh.halo = mesh.plan(np.arange(len(ghosts)))
@@ -220,6 +219,25 @@ class Mesh:
         x[self.own : self.columns] = _nothing(own.dtype)
         (halo or self.halo).fill(x)
         return x
+
+
+@kernel
+def _see(named, first, last, end, seen):  # type: ignore[no-untyped-def]
+    """Set the bits of cells that are not own; False where one is no cell and not the attractor."""
+    for e in range(len(named)):
+        cell = named[e]
+        if (cell < first or cell >= last) and cell != end:
+            if cell < 0 or cell > end:
+                return False
+            seen[cell >> 3] |= np.uint8(1 << (cell & 7))
+    return True
+
+
+def _seen(seen: NDArray[np.uint8]) -> Indices:
+    """Return the numbers of bits that are set, ascending."""
+    some = np.flatnonzero(seen)
+    place, bit = np.nonzero(np.unpackbits(seen[some, None], axis=1, bitorder="little"))
+    return some[place].astype(np.int64) * 8 + bit
 
 
 @kernel

@@ -4,7 +4,10 @@ Nothing here is imported unless the program was started by a launcher. Messages 
 lie in memory; what is small and of any kind is pickled: it comes from the same program.
 """
 
+import pickle
 import sys
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,6 +19,11 @@ from lmdsl.ranks.verbs import Alone, Item, RankError, Ranks, require_expected
 
 TAG, TROUBLE = 7, 8  # of messages between two ranks, and of those that one has failed
 KINDS = "?bhilqBHILQfd"  # types of arrays, by NumPy's character
+SMALL = 512  # bytes up to which all that is collected goes in one round
+
+# Seconds for which a rank waits attentively, then asleep: at first, at most. MPI alone keeps a
+# processor busy, which others need that share it.
+ATTENTIVE, NAP, LONGEST_NAP = 1e-4, 2e-5, 1e-3
 
 
 class MpiRanks(Ranks):
@@ -43,21 +51,23 @@ class MpiRanks(Ranks):
         while self._told:
             self._told.pop().Wait()
 
-    def _exchange(self, parcels: dict[int, NDArray[Any]]) -> dict[int, NDArray[Any]]:
-        # Of every array: its place in the series, type and size; -1 where none is sent.
-        head = np.full((self.count, 3), -1, dtype=np.int64)
-        head[:, 0] = self.traffic.calls
+    def _exchange(
+        self, parcels: dict[int, NDArray[Any]], more: bool
+    ) -> tuple[dict[int, NDArray[Any]], bool]:
+        # Of every array: its place in the series, type and size, -1 where none is sent; more.
+        head = np.full((self.count, 4), -1, dtype=np.int64)
+        head[:, 0], head[:, 3] = self.traffic.calls, more
         for to, array in parcels.items():
-            head[to, 1:] = KINDS.index(array.dtype.char), len(array)
+            head[to, 1:3] = KINDS.index(array.dtype.char), len(array)
         heads = np.empty_like(head)
-        self.world.Alltoall(head, heads)
+        waited(self.world.Ialltoall(head, heads).Test)
         self._require_alike(heads[:, 0])
         came = {
             int(k): np.empty(heads[k, 2], dtype=KINDS[heads[k, 1]])
             for k in np.flatnonzero(heads[:, 2] >= 0)
         }
         self._move(parcels, came)
-        return came
+        return came, bool(heads[:, 3].any())
 
     def _swap(
         self, parcels: dict[int, NDArray[Any]], expected: dict[int, int], kind: np.dtype[Any]
@@ -75,18 +85,33 @@ class MpiRanks(Ranks):
         """Send arrays, and receive others; return the sizes of those that came."""
         from mpi4py import MPI
 
-        asked = {k: self.world.Irecv(as_bytes(a), k, TAG) for k, a in into.items() if len(a)}
-        sent = [self.world.Isend(as_bytes(a), k, TAG) for k, a in parcels.items() if len(a)]
+        some = {k: a for k, a in into.items() if len(a)}
+        requests = [self.world.Irecv(as_bytes(a), k, TAG) for k, a in some.items()]
+        requests += [self.world.Isend(as_bytes(a), k, TAG) for k, a in parcels.items() if len(a)]
+        statuses = [MPI.Status() for _ in requests]
+        waited(lambda: MPI.Request.Testall(requests, statuses))
         sizes = dict.fromkeys(into, 0)
-        for k, request in asked.items():
-            status = MPI.Status()
-            request.Wait(status)
-            sizes[k] = status.Get_count(MPI.BYTE) // into[k].itemsize
-        MPI.Request.Waitall(sent)
+        for (k, array), status in zip(some.items(), statuses, strict=False):
+            sizes[k] = status.Get_count(MPI.BYTE) // array.itemsize
         return sizes
 
     def _collect(self, item: Item) -> list[Item]:
-        found = self.world.allgather((self.traffic.calls, item))
+        text = pickle.dumps((self.traffic.calls, item), pickle.HIGHEST_PROTOCOL)
+        own = np.zeros(SMALL, dtype=np.uint8)
+        own[:8] = np.array([len(text)], dtype=np.int64).view(np.uint8)
+        start = np.frombuffer(text, dtype=np.uint8)[: SMALL - 8]
+        own[8 : 8 + len(start)] = start
+        every = np.empty((self.count, SMALL), dtype=np.uint8)
+        waited(self.world.Iallgather(own, every).Test)
+        sizes = every[:, :8].copy().view(np.int64)[:, 0]
+        texts = [row[8:] for row in every]
+        if sizes.max() > SMALL - 8:
+            whole = np.empty(int(sizes.sum()), dtype=np.uint8)
+            ends = np.cumsum(sizes)
+            parts = [whole, sizes.tolist(), (ends - sizes).tolist(), as_byte_type()]
+            waited(self.world.Iallgatherv(np.frombuffer(text, dtype=np.uint8), parts).Test)
+            texts = np.split(whole, ends[:-1])
+        found = [pickle.loads(text.tobytes()) for text in texts]  # of the same program
         self._require_alike(np.array([calls for calls, _ in found]))
         return [its for _, its in found]
 
@@ -103,6 +128,26 @@ class MpiRanks(Ranks):
         sys.stdout.flush()
         sys.stderr.flush()
         self.world.Abort(status)
+
+
+def waited(ended: Callable[[], bool]) -> None:
+    """Return once messages have ended: soon after, and at little cost where it takes long."""
+    if ended():
+        return
+    since, nap = time.perf_counter(), NAP
+    while not ended():
+        if time.perf_counter() - since < ATTENTIVE:
+            time.sleep(0)  # for others that share this processor
+            continue
+        time.sleep(nap)
+        nap = min(1.5 * nap, LONGEST_NAP)
+
+
+def as_byte_type() -> Any:
+    """Return the type of a byte."""
+    from mpi4py import MPI
+
+    return MPI.BYTE
 
 
 def as_bytes(array: NDArray[Any]) -> NDArray[np.uint8]:

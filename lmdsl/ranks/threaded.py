@@ -64,15 +64,18 @@ class ThreadRanks(Ranks):
                 )
         return [item for *_, item in said]
 
-    def _exchange(self, parcels: dict[int, NDArray[Any]]) -> dict[int, NDArray[Any]]:
+    def _exchange(
+        self, parcels: dict[int, NDArray[Any]], more: bool
+    ) -> tuple[dict[int, NDArray[Any]], bool]:
         # A copy: whoever sends may write to its own array from here on.
-        said = self._met("exchange", {to: array.copy() for to, array in parcels.items()})
-        return {k: own[self.rank] for k, own in enumerate(said) if self.rank in own}
+        said = self._met("exchange", ({to: array.copy() for to, array in parcels.items()}, more))
+        came = {k: own[self.rank] for k, (own, _) in enumerate(said) if self.rank in own}
+        return came, any(its for _, its in said)
 
     def _swap(
         self, parcels: dict[int, NDArray[Any]], expected: dict[int, int], kind: np.dtype[Any]
     ) -> dict[int, NDArray[Any]]:
-        came = self._exchange(parcels)
+        came, _ = self._exchange(parcels, False)
         require_expected(self.rank, came, expected)
         return came
 

@@ -69,14 +69,9 @@ class Ranks(ABC):
         that send each other nothing need not wait for each other, all are of one ``kind``, and a
         parcel of another size is refused. An array for this rank itself comes back as it is.
         """
-        wrong = [to for to in parcels if not 0 <= to < self.count]
-        if wrong:
-            raise RankError(f"rank {self.rank} sends to rank {wrong[0]} of {self.count}")
-        others = {to: np.ascontiguousarray(a) for to, a in parcels.items() if to != self.rank}
-        self.traffic.calls += 1
-        self.traffic.sent += sum(array.nbytes for array in others.values())
+        others = self._others(parcels)
         if expected is None:
-            came = self._exchange(others)
+            came, _ = self._exchange(others, False)
         else:
             if any(array.dtype != kind for array in others.values()):
                 raise RankError(f"rank {self.rank} sends numbers that are not {np.dtype(kind)}")
@@ -85,6 +80,22 @@ class Ranks(ABC):
         if self.rank in parcels:
             came[self.rank] = parcels[self.rank]
         return dict(sorted(came.items()))
+
+    def exchange_news(self, parcels: Parcels) -> tuple[dict[int, NDArray[Any]], bool]:
+        """Exchange arrays, none for this rank itself; return whether any rank sent one, too."""
+        others = self._others(parcels)
+        came, more = self._exchange(others, bool(others))
+        return dict(sorted(came.items())), more
+
+    def _others(self, parcels: Parcels) -> dict[int, NDArray[Any]]:
+        """Return what goes to other ranks, counted as a verb."""
+        wrong = [to for to in parcels if not 0 <= to < self.count]
+        if wrong:
+            raise RankError(f"rank {self.rank} sends to rank {wrong[0]} of {self.count}")
+        others = {to: np.ascontiguousarray(a) for to, a in parcels.items() if to != self.rank}
+        self.traffic.calls += 1
+        self.traffic.sent += sum(array.nbytes for array in others.values())
+        return others
 
     def collect(self, item: Item) -> list[Item]:
         """Return what every rank gives, in the order of ranks, on every rank."""
@@ -187,7 +198,9 @@ class Ranks(ABC):
         """Note which ranks had failed, once all have ended their work."""
 
     @abstractmethod
-    def _exchange(self, parcels: dict[int, NDArray[Any]]) -> dict[int, NDArray[Any]]: ...
+    def _exchange(
+        self, parcels: dict[int, NDArray[Any]], more: bool
+    ) -> tuple[dict[int, NDArray[Any]], bool]: ...
 
     @abstractmethod
     def _swap(
@@ -214,8 +227,10 @@ class Alone(Ranks):
     def _calm(self, failed: list[int]) -> None:
         pass
 
-    def _exchange(self, parcels: dict[int, NDArray[Any]]) -> dict[int, NDArray[Any]]:
-        return {}
+    def _exchange(
+        self, parcels: dict[int, NDArray[Any]], more: bool
+    ) -> tuple[dict[int, NDArray[Any]], bool]:
+        return {}, more
 
     def _swap(
         self, parcels: dict[int, NDArray[Any]], expected: dict[int, int], kind: np.dtype[Any]
