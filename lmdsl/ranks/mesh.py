@@ -15,7 +15,7 @@ The certificate does not see a wrong ghost: claims about wrong numbers hold too.
 """
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,12 +126,18 @@ class Mesh:
         own = np.arange(*self.division.own(self.ranks.rank), dtype=np.int64)
         return np.concatenate([own, self.ghosts, [self.division.cells]])
 
-    def local(self, cells: NDArray[np.integer]) -> NDArray[np.int32]:
-        """Return the local numbers of cells given by global ones; each is looked up and back."""
+    def local(
+        self, cells: NDArray[np.integer], into: NDArray[np.int32] | None = None
+    ) -> NDArray[np.int32]:
+        """Return the local numbers of cells given by global ones; each is looked up and back.
+
+        They are written ``into`` an array where one is given, which may be that of the cells.
+        """
         first, last = self.division.own(self.ranks.rank)
-        found = np.empty(len(cells), dtype=np.int32)
-        known = _localise(np.asarray(cells), first, last, self.ghosts, self.division.cells, found)
-        if not known:
+        cells = np.asarray(cells)
+        found = np.empty(len(cells), dtype=np.int32) if into is None else into
+        places = _Places(first, last, self.division.cells, self.ghosts, *_buckets(self.ghosts))
+        if not _localise(cells, places, found):
             raise RankError(f"rank {self.ranks.rank} has no ghost for a cell that its rows name")
         return found
 
@@ -240,18 +246,44 @@ def _seen(seen: NDArray[np.uint8]) -> Indices:
     return some[place].astype(np.int64) * 8 + bit
 
 
+class _Places(NamedTuple):
+    """Own cells and ghosts; of every bucket of 2^shift cells from ``low`` its first ghost."""
+
+    first: int
+    last: int
+    end: int  # the attractor
+    ghosts: Indices
+    low: int
+    shift: int
+    start: Indices
+
+
+def _buckets(ghosts: Indices) -> tuple[int, int, Indices]:
+    """Return where to look for ghosts: about as many buckets as there are ghosts."""
+    if not len(ghosts):
+        return 0, 0, np.zeros(1, dtype=np.int64)
+    low, span = int(ghosts[0]), int(ghosts[-1] - ghosts[0]) + 1
+    shift = max(0, (span // (2 * len(ghosts))).bit_length())
+    starts = low + (np.arange((span >> shift) + 2, dtype=np.int64) << shift)
+    return low, shift, np.searchsorted(ghosts, starts).astype(np.int64)
+
+
 @kernel
-def _localise(cells, first, last, ghosts, end, found):  # type: ignore[no-untyped-def]
+def _localise(cells, places, found):  # type: ignore[no-untyped-def]
     """Write local numbers; False where a cell is not own, no ghost and not the attractor."""
+    first, last, end, ghosts, least, shift, start = places
     own = last - first
     for e in range(len(cells)):
-        cell = cells[e]
+        cell = np.int64(cells[e])
         if first <= cell < last:
             found[e] = cell - first
         elif cell == end:
             found[e] = own + len(ghosts)
         else:
-            low, high = 0, len(ghosts)
+            bucket = (cell - least) >> shift
+            if bucket < 0 or bucket + 1 >= len(start):
+                return False
+            low, high = start[bucket], start[bucket + 1]
             while low < high:
                 middle = (low + high) // 2
                 if ghosts[middle] < cell:

@@ -85,8 +85,20 @@ def assembled(
         lambda: assemble(problem, partition, deadline=deadline, sets=sets, span=span)
     )
     mesh = Mesh.of(ranks, division, own.rows.target)
-    rows = replace(own.rows, target=mesh.local(own.rows.target), columns=mesh.columns)
+    given = isinstance(problem.system, MatrixSystem)
+    rows = replace(own.rows, target=_localised(mesh, own.rows, given), columns=mesh.columns)
     return OwnPairs(sets, mesh, own.pair_pointer, own.control, own.cost, rows)
+
+
+def _localised(mesh: Mesh, rows: Rows, given: bool) -> NDArray[np.int32]:
+    """Return targets in local numbers, in the memory of the others unless these are ``given``."""
+    if given:  # by the problem, which others read
+        return mesh.local(rows.target)
+    target = rows.target
+    target.setflags(write=True)
+    found = mesh.local(target, target)
+    found.setflags(write=False)
+    return found
 
 
 def divided(
