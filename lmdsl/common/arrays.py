@@ -1,4 +1,4 @@
-"""Archives of arrays (.npz): written plainly, and read with suspicion.
+"""Archives of arrays (.npz) and arrays (.npy): written plainly, and read with suspicion.
 
 An array is accepted only with the shape and type that is expected of it, judged from the size of
 the file, the archive's directory and the headers before anything is allocated. Pickles are never
@@ -68,6 +68,33 @@ def unpacked(file: BinaryIO, name: str, expected: Expected) -> dict[str, NDArray
     return arrays
 
 
+def header(shape: tuple[int, ...], kind: str) -> bytes:
+    """Return what a file .npy of an array begins with."""
+    written = io.BytesIO()
+    about = {"descr": kind, "fortran_order": False, "shape": shape}
+    np.lib.format.write_array_header_1_0(written, about)
+    return written.getvalue()
+
+
+def mapped(file: BinaryIO, name: str, shape: tuple[int, ...], kind: str) -> NDArray[Any]:
+    """Return the array of a file .npy, read-only, of which nothing is read before it is needed.
+
+    BadInput: it is not exactly of this shape and type, or its file is not just as long.
+    """
+    try:
+        _require_header(file, name, shape, np.dtype(kind))
+        begins, size = file.tell(), file.seek(0, io.SEEK_END)
+    except BadInput:
+        raise
+    except Exception as error:  # header parsers raise what they like
+        if isinstance(error, MemoryError):
+            raise
+        raise BadInput(f"not a readable array: {shown(str(error))}", name) from None
+    if size != begins + _size(shape, kind):
+        raise BadInput(f"holds {size - begins} bytes where {_size(shape, kind)} are expected", name)
+    return np.memmap(file, np.dtype(kind), "r", begins, shape).view(np.ndarray)
+
+
 class _Bounded:
     """A file of which the archive's directory is read, but no more than a directory needs."""
 
@@ -99,13 +126,17 @@ def _member(
     if info.compress_type not in _METHODS:
         raise BadInput(f"compression method {info.compress_type} is not supported", name)
     with archive.open(info) as file:
-        version = np.lib.format.read_magic(file)
-        if version != (1, 0):
-            raise BadInput(f"array format {version} is not supported", name)
-        found, fortran, stored = np.lib.format.read_array_header_1_0(file)
-        if found != shape or fortran or stored != kind:
-            raise BadInput(f"is {stored} of shape {found}, not {kind} of shape {shape}", name)
+        _require_header(file, name, shape, kind)
         content = file.read(size + 1)
     if len(content) != size:
         raise BadInput(f"ends after {len(content)} of {size} bytes", name)
     return np.frombuffer(content, dtype=kind).reshape(shape).copy()
+
+
+def _require_header(file: Any, name: str, shape: tuple[int, ...], kind: np.dtype[Any]) -> None:
+    version = np.lib.format.read_magic(file)
+    if version != (1, 0):
+        raise BadInput(f"array format {version} is not supported", name)
+    found, fortran, stored = np.lib.format.read_array_header_1_0(file)
+    if found != shape or fortran or stored != kind:
+        raise BadInput(f"is {stored} of shape {found}, not {kind} of shape {shape}", name)

@@ -44,7 +44,7 @@ def write_whole(path: Path, content: bytes | Iterable[bytes]) -> None:
         raise BadInput(f"cannot write {shown(str(path), 200)}: {reason(error)}") from None
 
 
-def write_new(path: Path, pieces: Iterable[bytes]) -> None:
+def write_new(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
     """Write a file that must not exist yet, and wait until it is on the disk."""
     with open(path, "xb") as file:
         file.writelines(pieces)

@@ -74,8 +74,9 @@ class Result(Paged, Carried, Summary, InUse):
         Gap of the backend's own policy, None where nothing could be certified of it.
     lp
         The compiled model; None for a result read from a directory.
-    model_sha256
-        Digest of the compiled model, as read from a directory.
+    model_sha256, digest
+        Digest of the compiled model, as read from a directory, and its version: 1, or 2 of a model
+        that was compiled over ranks.
     cause
         Why it is not stabilizable: ``empty``, ``measure``, ``gamma``, ``require_all``, ``hold``.
     """
@@ -100,6 +101,7 @@ class Result(Paged, Carried, Summary, InUse):
     cause: Cause | None = None
     lp: StabilizationLP | None = None
     model_sha256: str = ""
+    digest: int = 1
 
     @property
     def verified(self) -> bool:

@@ -108,7 +108,7 @@ def solve(
     )
     if proved is None:
         return _solved(problem, request)
-    from lmdsl.results.directory import repairing
+    from lmdsl.results.directory.repair import repairing
 
     declared = problem if isinstance(problem, Problem) else problem.problem
     repairing.require_provable(proved, declared, restrict_to_gamma)

@@ -31,12 +31,13 @@ from lmdsl.model.rows import Rows
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
-from lmdsl.results.directory import archive, repaired
+from lmdsl.results.directory import archive
 from lmdsl.results.directory.audit import differences, local_differences
 from lmdsl.results.directory.functions import function_differences, function_notes
 from lmdsl.results.directory.proved import proof_findings
 from lmdsl.results.directory.recorded import policy_of
-from lmdsl.results.directory.repaired import Judge
+from lmdsl.results.directory.repair import repaired
+from lmdsl.results.directory.repair.repaired import Judge
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.systems import MatrixSystem
@@ -154,7 +155,7 @@ def verify(
         reasons += function_differences(lp, result)
         notes = function_notes(result) + notes
     lp = _restricted(lp, result, reasons, judge)
-    same = result.model_sha256 in (lp.digest, archive.identity(lp))
+    same = archive.names(result, lp)
     if not same:
         notes.append("the recompiled model differs from the stored one; claims are judged on it")
     if not _same_cells(lp, result):

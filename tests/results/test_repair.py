@@ -15,8 +15,8 @@ from lmdsl.cli import main
 from lmdsl.machine.deadline import Deadline
 from lmdsl.proof import proving
 from lmdsl.results.directory import reading
-from lmdsl.results.directory.repairing import _advice
-from lmdsl.results.directory.rounds import LAST, NONE, SOON, Round, Rounds
+from lmdsl.results.directory.repair.repairing import _advice
+from lmdsl.results.directory.repair.rounds import LAST, NONE, SOON, Round, Rounds
 
 pytestmark = pytest.mark.long  # in other versions it would find nothing else
 

@@ -24,7 +24,7 @@ from lmdsl.systems import FunctionSystem
 # Keys of certificate.json that say history, options, text; of the digest a difference is said.
 NOT_CLAIMED = (
     "backend", "solver_status", "tolerance", "polish_steps", "iterations", "gap_before_polish",
-    "seconds", "versions", "message", "model_sha256",
+    "seconds", "versions", "message", "model_sha256", "digest",
 )  # fmt: skip
 
 ORBIT = [[0.25, 0.5], [0.75, 0.5]]

@@ -19,39 +19,26 @@ from numpy.typing import NDArray
 
 from lmdsl.certificate.claims import Certificate
 from lmdsl.certificate.judge import CLAIMS
-from lmdsl.common import arrays, inputs
-from lmdsl.common.files import MAX_FILE_BYTES, parsed, reason
+from lmdsl.common import arrays
+from lmdsl.common.files import reason
 from lmdsl.common.records import jsonable
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.problem.problem import Problem, parse_problem
-from lmdsl.results.directory import proved, reading, repaired, writing
+from lmdsl.problem.problem import Problem
+from lmdsl.ranks.verbs import Alone
+from lmdsl.results.directory import proved, reading, vectors, writing
 from lmdsl.results.directory.certificate_file import CertificateFile, scope
+from lmdsl.results.directory.declared import own_problem
 from lmdsl.results.directory.reading import FORMAT, Reading
+from lmdsl.results.directory.repair import repaired
+from lmdsl.results.directory.vectors import TYPES as TYPES
+from lmdsl.results.directory.vectors import types
 from lmdsl.results.result import Result
-from lmdsl.systems import NAMED, DataSystem, FunctionSystem, MatrixSystem, System
-from lmdsl.systems.black_box.cost import FUNCTION
-from lmdsl.systems.matrices.rows import MOST_LIMBS, GivenRows
-from lmdsl.systems.named import NamedOde, NotStored
-
-GIVEN: dict[Any, type[MatrixSystem]] = {"matrices": MatrixSystem, "data": DataSystem}
-TYPES = {
-    "control_index": "<i4",
-    "value": "<f8",
-    "lower": "<f8",
-    "measure": "<f8",
-    "cell_status": "|u1",
-    "witness": "<f8",
-}
-
-
-def _types(problem: Problem) -> dict[str, str]:
-    """Return the types of the arrays of a solution."""
-    return TYPES | ({"sure_levels": "<i4"} if problem.successors == "enclosed" else {})
+from lmdsl.slabs.digest import of_model
+from lmdsl.systems import MatrixSystem
 
 
 def save(result: Result, path: str | os.PathLike[str]) -> None:
@@ -88,6 +75,17 @@ def rescue(result: Result, path: str | os.PathLike[str]) -> Path | None:
 
 def _contents(result: Result) -> dict[str, bytes]:
     """Return the files of a result but its certificate."""
+    contents = _declared(result)
+    contents[vectors.ARCHIVE] = arrays.packed(
+        {name: getattr(result, name) for name in types(result.problem)}
+    )
+    if result.proof is not None:
+        contents[proved.NAME] = arrays.packed(result.proof.arrays())
+    return contents | repaired.contents(result)
+
+
+def _declared(result: Result) -> dict[str, bytes]:
+    """Return the files that say what was solved."""
     problem, contents = result.problem, {}
     if problem.functions:
         data = _function_problem(problem)
@@ -105,12 +103,7 @@ def _contents(result: Result) -> dict[str, bytes]:
     else:
         data = problem.to_dict()
     contents["problem.json"] = reading.text(data)
-    contents["solution.npz"] = arrays.packed(
-        {name: getattr(result, name) for name in _types(problem)}
-    )
-    if result.proof is not None:
-        contents[proved.NAME] = arrays.packed(result.proof.arrays())
-    return contents | repaired.contents(result)
+    return contents
 
 
 def _certificate(result: Result) -> dict[str, Any]:
@@ -122,6 +115,7 @@ def _certificate(result: Result) -> dict[str, Any]:
         "measure_residual": proof.measure_residual,
         "reasons": proof.reasons,
         "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
+        "digest": result.digest if result.lp is None else 1,
         "versions": versions(),
         "scope": scope(result.problem),
         "proof": proved.said_of(result.proof),
@@ -133,16 +127,25 @@ def _certificate(result: Result) -> dict[str, Any]:
     }
 
 
-def identity(lp: StabilizationLP) -> str:
+def identity(lp: StabilizationLP, version: int = 1) -> str:
     """Return the digest that a certificate names: that of the compiled model.
 
-    The rows of a Python function cannot be made anew from another problem: its digest is also of
-    all that the problem says, but the name.
+    Version 2 is that of a model over ranks. The rows of a Python function cannot be made anew from
+    another problem: its digest is also of all that the problem says, but the name.
     """
+    if version == 2:
+        return of_model(Alone(), lp)
     if not lp.problem.functions:
         return lp.digest
     said = {**_function_problem(lp.problem), "name": "", "model_sha256": lp.digest}
     return hashlib.sha256(reading.text(said)).hexdigest()
+
+
+def names(result: Result, lp: StabilizationLP) -> bool:
+    """Return whether a result that was read names the digest of a model; see :func:`identity`."""
+    if result.digest == 1 and result.model_sha256 == lp.digest:  # earlier it was always this one
+        return True
+    return result.model_sha256 == identity(lp, result.digest)
 
 
 def _function_problem(problem: Problem) -> dict[str, Any]:
@@ -208,7 +211,7 @@ def problem_of(path: str | os.PathLike[str]) -> Problem:
 
     BadInput: it is unreadable, or its files are of several saves.
     """
-    return reading.read(Path(path), _own_problem)
+    return reading.read(Path(path), own_problem)
 
 
 def read_model(
@@ -219,27 +222,20 @@ def read_model(
     def model(files: Reading) -> dict[str, NDArray[Any]]:
         if files.certificate.get("model_sha256") != result.model_sha256:
             raise BadInput("another save replaced the directory; start again", "model.npz")
-        return _arrays(files, "model.npz", expected)
+        return files.arrays("model.npz", expected)
 
     return reading.read(Path(path), model)
 
 
-def _arrays(files: Reading, name: str, expected: arrays.Expected) -> dict[str, NDArray[Any]]:
-    return arrays.unpacked(files.open(name, arrays.largest(expected)), name, expected)
-
-
 def _read(files: Reading) -> Stored:
-    problem = _own_problem(files)
+    problem = own_problem(files)
     stored = CertificateFile.read(files.certificate)
     partition = Partition.of(problem)
     N = partition.size
     M = min(control_count(problem), 10**40)
-    memory.require(64 * N + 8 * M * (2 + len(problem.control_grid)), "arrays of the result")
-    vectors = _arrays(
-        files, "solution.npz", {name: ((N,), kind) for name, kind in _types(problem).items()}
-    )
-    vectors |= repaired.read(files, stored.proved, N, M)
-    result = _result(problem, partition, stored, vectors)
+    memory.require(8 * M * (2 + len(problem.control_grid)), "arrays of the result")
+    loaded = vectors.read(files, problem, N) | repaired.read(files, stored.proved, N, M)
+    result = _result(problem, partition, stored, loaded)
     proved.attach(files.folder, result, stored.proof)
     return Stored(result, stored, tuple(files.rewritten))
 
@@ -247,12 +243,8 @@ def _read(files: Reading) -> Stored:
 def _result(
     problem: Problem, partition: Partition, stored: CertificateFile, loaded: dict[str, NDArray[Any]]
 ) -> Result:
-    vectors = control_vectors(problem)
-    index = loaded["control_index"]
-    if index.size and not (index.min() >= -1 and index.max() < len(vectors)):
-        raise BadInput("control_index holds an index outside the control grid", "solution.npz")
-    if loaded["cell_status"].max(initial=0) > max(CellStatus):
-        raise BadInput("cell_status holds an unknown code", "solution.npz")
+    controls = control_vectors(problem)
+    vectors.require_codes(loaded["control_index"], loaded["cell_status"], len(controls))
     said = dict(stored) | loaded
     del said["proof"]  # its keys; the boxes stay in their file
     known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said}
@@ -263,57 +255,5 @@ def _result(
     certificate = Certificate(**proof)
     return Result(
         **known, problem=problem, partition=partition, certificate=certificate,
-        control_vectors=vectors,
+        control_vectors=controls,
     )  # fmt: skip
-
-
-def _own_problem(files: Reading) -> Problem:
-    content = files.open("problem.json", MAX_FILE_BYTES).read()
-    return _problem(parsed(files.folder / "problem.json", content), files)
-
-
-def _problem(data: Any, files: Reading) -> Problem:
-    """Return the problem of a directory, with what its file leaves out."""
-    if not isinstance(data, dict):
-        return parse_problem(data)
-    held, system = {**data}, data.get("system")
-    # A function cannot be stored: everything but calling it still works.
-    if data.get("stage_cost") == FUNCTION:
-        held["stage_cost"] = _not_stored
-    if isinstance(system, dict):
-        held["system"] = _system(system, str(system.get("kind")), files)
-    return parse_problem(held)
-
-
-def _system(system: dict[str, Any], kind: str, files: Reading) -> Any:
-    if kind == "function":
-        known = {key: system[key] for key in ("parameters", "lipschitz") if key in system}
-        return FunctionSystem(next=_not_stored, **known)
-    if kind in GIVEN:
-        return _matrices(GIVEN[kind], system, files)
-    if "judged" not in system and (kind == "ode" or issubclass(NAMED.get(kind, System), NamedOde)):
-        # Saved before paths were judged: the files mean what they meant.
-        return {**system, "judged": "endpoint"}
-    return system
-
-
-def _matrices(model: type[MatrixSystem], system: dict[str, Any], files: Reading) -> MatrixSystem:
-    """Read the rows of a finite model."""
-    where = "problem.json.system.sizes"
-    held = system.get("sizes")
-    names = ("cells", "controls", "pairs", "entries", "codes", "limbs")
-    if not isinstance(held, dict) or set(held) != set(names):
-        raise BadInput(f"the sizes are those of {', '.join(names)}", where)
-    sizes = {name: inputs.whole(held[name], where, 0, 2**31) for name in names}
-    if sizes["limbs"] > MOST_LIMBS:
-        raise BadInput(f"{sizes['limbs']} digits; at most {MOST_LIMBS}", where)
-    expected = GivenRows.expected(sizes)
-    memory.require(12 * arrays.largest(expected), "the rows of a finite model")
-    rows = GivenRows.read(sizes, _arrays(files, "model.npz", expected))
-    more = {key: value for key, value in system.items() if key not in ("kind", "sizes")}
-    found: MatrixSystem = model.model_validate({**more, "rows": rows})
-    return found
-
-
-def _not_stored(**values: Any) -> Any:
-    raise NotStored("this result came from a Python function, which a directory does not hold")

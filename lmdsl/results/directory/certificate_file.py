@@ -116,6 +116,7 @@ class CertificateFile(_Keys):
     iterations: int | None
     gap_before_polish: float | None
     model_sha256: str
+    digest: Literal[1, 2] = 1
     versions: dict[str, str] = Field(default_factory=dict)
     scope: str = System.scope
     proof: ProofKeys | None = None

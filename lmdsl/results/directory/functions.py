@@ -8,7 +8,7 @@ from lmdsl.model.local.holding import within
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.results.directory.archive import identity
+from lmdsl.results.directory.archive import names
 from lmdsl.results.result import Result
 
 # What verify notes by the keys of the problem that are functions.
@@ -56,7 +56,7 @@ def function_differences(lp: StabilizationLP, result: Result) -> list[str]:
                 wrong &= ~(_entering(lp) & (lp.cost >= cost - slack))
         if wrong.any():
             reasons.append(f"cost of {int(wrong.sum())} pairs is not the stage cost of the problem")
-    if result.model_sha256 not in (lp.digest, identity(lp)):  # earlier it was the first
+    if not names(result, lp):
         reasons.append("the saved rows, or what the problem says, are not those of model_sha256")
     return reasons
 

@@ -30,9 +30,10 @@ from lmdsl.proof.proving import Ending
 from lmdsl.proof.proving import prove as proved
 from lmdsl.proof.record import BOX, Proof, expected
 from lmdsl.proof.warming import warm
-from lmdsl.results.directory import reading, repaired, writing
+from lmdsl.results.directory import reading, vectors, writing
 from lmdsl.results.directory.certificate_file import ProofKeys
 from lmdsl.results.directory.reading import Reading
+from lmdsl.results.directory.repair import repaired
 from lmdsl.results.result import Result
 
 NAME = "proof.npz"
@@ -125,12 +126,13 @@ def add(path: str | os.PathLike[str], result: Result, proof: Proof) -> None:
     """
     folder = writing.place(path)
 
-    def content(files: Reading) -> tuple[dict[str, Any], dict[str, bytes]]:
-        loaded = _policy(files, result)
-        if not all(np.array_equal(x, getattr(result, name)) for name, x in loaded.items()):
+    def content(files: Reading) -> tuple[dict[str, Any], dict[str, writing.Content]]:
+        loaded = vectors.read(files, result.problem, result.partition.size)
+        told = ("control_index", "cell_status")
+        if not all(np.array_equal(loaded[name], getattr(result, name)) for name in told):
             raise BadInput("another save replaced the directory; prove it again", "solution.npz")
         names = [n for n in files.digests or ("problem.json", "solution.npz") if n != NAME]
-        return files.certificate, {name: files.open(name).read() for name in names}
+        return files.certificate, {name: files.content(name) for name in names}
 
     certificate, files = reading.read(folder, content)
     files[NAME] = arrays.packed(proof.arrays())
@@ -152,12 +154,6 @@ def said_of(proof: Proof | None) -> Any:
     if proof is None:
         return None
     return {name: jsonable(getattr(proof, name)) for name in ProofKeys.model_fields}
-
-
-def _policy(files: Reading, result: Result) -> dict[str, NDArray[Any]]:
-    N = result.partition.size
-    wanted = {"control_index": ((N,), "<i4"), "cell_status": ((N,), "|u1")}
-    return arrays.unpacked(files.open("solution.npz"), "solution.npz", wanted)
 
 
 def read(path: str | os.PathLike[str], result: Result, said: ProofKeys) -> dict[str, NDArray[Any]]:

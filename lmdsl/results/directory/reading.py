@@ -8,23 +8,34 @@ the old ones. Files of two saves are refused, or read again while another save i
 
 import hashlib
 import json
+import mmap
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
+from numpy.typing import NDArray
+
+from lmdsl.common import arrays
 from lmdsl.common.arrays import MARK
 from lmdsl.common.files import MAX_FILE_BYTES, open_regular, parsed, read_bytes, reason, strict_json
 from lmdsl.errors import BadInput, shown
 
 FORMAT = "lmdsl-result/1"
 COMMIT = "certificate.json"
+# Vectors that stand each in a file of its own, instead of all in solution.npz.
+APART = tuple(
+    f"{name}.npy"
+    for name in ("control_index", "value", "lower", "measure", "cell_status", "witness",
+                 "sure_levels")
+)  # fmt: skip
 # The files of a save; of the others in a directory none is read, replaced or removed.
-NAMES = ("problem.json", "solution.npz", "model.npz", "proof.npz", "dropped.npz", COMMIT)
+NAMES = ("problem.json", "solution.npz", *APART, "model.npz", "proof.npz", "dropped.npz", COMMIT)
 SAVE = "[0-9a-f]{16}"
+BLOCKS, BLOCK = "blocks:", 2**20  # digests of files of which blocks of so many bytes are hashed
 TRIES = 100  # number of attempts to read one save while others replace it
 T = TypeVar("T")
 
@@ -104,6 +115,17 @@ class Reading:
         found.seek(0)
         return found
 
+    def content(self, name: str) -> bytes | memoryview:
+        """Return what a file of this save holds; a large one is mapped."""
+        file = self.open(name)
+        if name not in APART:
+            return file.read()
+        return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+
+    def arrays(self, name: str, expected: arrays.Expected) -> dict[str, NDArray[Any]]:
+        """Read arrays of an archive of this save."""
+        return arrays.unpacked(self.open(name, arrays.largest(expected)), name, expected)
+
     def _opened(self, name: str) -> BinaryIO | BadInput:
         path = self.folder / name
         try:
@@ -148,14 +170,36 @@ def _is(file: BinaryIO | BadInput, digest: str, limit: int | None) -> bool:
     if isinstance(file, BadInput) or (limit is not None and _size(file) > limit):
         return False
     file.seek(0)
+    if digest.startswith(BLOCKS):
+        return of_blocks(block_hashes(iter(lambda: file.read(BLOCK), b""))) == digest
     found = hashlib.sha256()
     while piece := file.read(2**20):
         found.update(piece)
     return found.hexdigest() == digest
 
 
+def block_hashes(blocks: Iterable[bytes | memoryview]) -> bytes:
+    """Return the SHA-256 of every block of a file, one after the other."""
+    return b"".join(hashlib.sha256(block).digest() for block in blocks)
+
+
+def of_blocks(hashes: bytes) -> str:
+    """Return the digest of a file that many hash at a time: that of its blocks' hashes."""
+    return BLOCKS + hashlib.sha256(hashes).hexdigest()
+
+
+def digest_of(name: str, content: bytes | memoryview) -> str:
+    """Return the digest of a file, as certificate.json names it."""
+    if name not in APART:
+        return hashlib.sha256(content).hexdigest()
+    whole = memoryview(content)
+    return of_blocks(block_hashes(whole[k : k + BLOCK] for k in range(0, len(whole), BLOCK)))
+
+
 def _as_saved(name: str, file: BinaryIO) -> bool:
     """Return whether a file looks as a save writes it, so that it is one of another save."""
+    if name.endswith(".npy"):
+        return True
     if name.endswith(".npz"):
         file.seek(max(0, _size(file) - len(MARK)))
         return file.read() == MARK

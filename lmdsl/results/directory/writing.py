@@ -8,7 +8,6 @@ made beside its place, under a hidden name, and renamed.
 
 import contextlib
 import errno
-import hashlib
 import os
 import random
 import re
@@ -16,7 +15,7 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from lmdsl.results.directory.reading import (
     TRIES,
     Mixture,
     Reading,
+    digest_of,
     read,
     stored,
 )
@@ -38,6 +38,7 @@ try:
 except ImportError:  # pragma: no cover
     fcntl = None  # type: ignore[assignment]
 
+Content = bytes | memoryview  # of a file; of a large one its memory
 PATIENCE = 10.0  # seconds that a save waits for another one
 _HIDDEN = re.compile(rf"\.({'|'.join(map(re.escape, NAMES))})\.({SAVE})")
 _LITTER = r"\.DS_Store|Thumbs\.db|desktop\.ini|lost\+found|\._.*|\.nfs.*|\.fuse_hidden.*"
@@ -112,7 +113,7 @@ def _existing_parent(target: Path) -> Path:
 
 
 def write(
-    target: Path, files: Mapping[str, bytes], commit: Callable[[dict[str, Any]], bytes]
+    target: Path, files: Mapping[str, Content], commit: Callable[[dict[str, Any]], bytes]
 ) -> None:
     """Write the files of one save; what an older save left at the same place is replaced.
 
@@ -120,7 +121,7 @@ def write(
     the keys that join it to them. OSError: the place cannot be used; the old files are still there
     then.
     """
-    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
+    digests = {name: digest_of(name, content) for name, content in files.items()}
     target.parent.mkdir(parents=True, exist_ok=True)
     failure: OSError | None = None
     for attempt in range(TRIES):
@@ -139,7 +140,57 @@ def write(
     raise failure or OSError(errno.EBUSY, "other saves write there at the same time")
 
 
-def _made(target: Path, files: Mapping[str, bytes]) -> bool:
+class Begun:
+    """A save of which others write large files, in place, before it appears as a whole.
+
+    Attributes
+    ----------
+    save
+        Its name.
+    """
+
+    def __init__(self, target: Path) -> None:
+        self.target, self.save = target, secrets.token_hex(8)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        self._beside = not target.is_dir()
+        self._folder = target
+        if self._beside:
+            start = f".{target.name[:40]}."
+            _tidy_beside(target, start)
+            self._folder = target.with_name(start + self.save)
+            self._folder.mkdir()
+
+    def path(self, name: str) -> Path:
+        """Return where a file is to be written."""
+        return self._folder / (name if self._beside else f".{name}.{self.save}")
+
+    def finish(
+        self, files: Mapping[str, Content], there: Mapping[str, str],
+        commit: Callable[[dict[str, Any]], bytes],
+    ) -> None:  # fmt: skip
+        """Write the other files, and let the save appear; ``there`` are digests of the large ones.
+
+        OSError: the place cannot be used; the old files are still there then.
+        """
+        digests = {**{name: digest_of(name, content) for name, content in files.items()}, **there}
+        whole = {**files, COMMIT: commit({"save": self.save, "files": digests})}
+        if self._beside:
+            for name, content in whole.items():
+                write_new(self.path(name), [content])
+            os.rename(self._folder, self.target)
+        else:
+            with _alone(self.target):
+                _replace(self.target, whole, self.save, [*there])
+
+    def abandon(self) -> None:
+        """Remove what was written, where the save has not appeared."""
+        if self._beside:
+            _remove(self._folder)
+        else:
+            _tidy(self.target)
+
+
+def _made(target: Path, files: Mapping[str, Content]) -> bool:
     """Make a directory that does not exist; False where another save was faster."""
     start = f".{target.name[:40]}."
     _tidy_beside(target, start)
@@ -203,29 +254,34 @@ def _locked(descriptor: int) -> bool:
     return True
 
 
-def _replace(target: Path, files: Mapping[str, bytes], save: str) -> None:
-    """Write files under hidden names into a directory, and rename them, certificate.json first."""
-    _tidy(target)
-    hidden = {name: target / f".{name}.{save}" for name in (COMMIT, *files)}
+def _replace(
+    target: Path, files: Mapping[str, Content], save: str, there: Iterable[str] = ()
+) -> None:
+    """Write files under hidden names into a directory, and rename them, certificate.json first.
+
+    Those that are ``there`` have been written under these names.
+    """
+    _tidy(target, save)
+    hidden = {name: target / f".{name}.{save}" for name in (COMMIT, *files, *there)}
     try:
         for name, content in files.items():
             write_new(hidden[name], [content])
         for name, path in hidden.items():
             os.replace(path, target / name)
-        for name in set(NAMES) - set(files):
+        for name in set(NAMES) - set(hidden):
             with contextlib.suppress(FileNotFoundError):
                 (target / name).unlink()
     finally:
         _tidy(target)
 
 
-def _tidy(target: Path) -> None:
-    """Remove hidden files that the certificate in place does not name."""
+def _tidy(target: Path, spared: str = "") -> None:
+    """Remove hidden files that the certificate in place does not name, nor are of a save."""
     with contextlib.suppress(OSError, BadInput):
         kept = stored(target).get("save") if os.path.lexists(target / COMMIT) else None
         for name in os.listdir(target):
             found = _HIDDEN.fullmatch(name)
-            if found and found[2] != kept and not (target / name).is_dir():
+            if found and found[2] not in (kept, spared) and not (target / name).is_dir():
                 with contextlib.suppress(OSError):  # another save removes the same
                     os.unlink(target / name)
 

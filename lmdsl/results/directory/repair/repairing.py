@@ -19,7 +19,7 @@ from lmdsl.model.successors.left_out.dropping import list_sha256
 from lmdsl.model.successors.left_out.staying import Staying
 from lmdsl.problem.problem import Problem
 from lmdsl.proof.search import LOST, STAYS, UNDECIDED
-from lmdsl.results.directory.rounds import LAST, SOON, Again, Round, Rounds, volume
+from lmdsl.results.directory.repair.rounds import LAST, SOON, Again, Round, Rounds, volume
 from lmdsl.results.result import Result
 from lmdsl.results.summary import Proved
 from lmdsl.systems import MatrixSystem

@@ -1,0 +1,166 @@
+"""Directories whose vectors are files of their own, as ranks write them: the same, but mapped."""
+
+import json
+import os
+import shutil
+
+import numpy as np
+import pytest
+from problems import made, standard_map
+from saved_results import names, posix, refused
+
+import lmdsl as lm
+from lmdsl.cli import main
+from lmdsl.common import arrays
+from lmdsl.results.directory import reading, vectors, writing
+
+OURS = {"certificate.json", "problem.json", *(f"{name}.npy" for name in vectors.TYPES)}
+
+
+def content(array, kind):
+    return arrays.header(array.shape, kind) + array.tobytes()
+
+
+def put_apart(source, target, **changed):
+    """Write a saved result anew, every vector in its own file."""
+    result, about = lm.Result.load(source), json.loads((source / "certificate.json").read_text())
+    begun, there = writing.Begun(target), {}
+    for name, kind in vectors.TYPES.items():
+        file = f"{name}.npy"
+        held = changed.get(name, content(getattr(result, name), kind))
+        begun.path(file).write_bytes(held)
+        there[file] = reading.digest_of(file, held)
+    files = {"problem.json": (source / "problem.json").read_bytes()}
+    begun.finish(files, there, lambda keys: reading.text({**about, **keys}))
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    target = tmp_path_factory.mktemp("saved") / "out"
+    lm.solve(made(standard_map(10))).save(target)
+    return target
+
+
+@pytest.fixture
+def target(saved, tmp_path):
+    put_apart(saved, tmp_path / "apart")
+    return tmp_path / "apart"
+
+
+def test_it_is_the_same_result(saved, target, tmp_path):
+    assert names(target) == OURS
+    one, found = lm.Result.load(saved), lm.Result.load(target)
+    for name in vectors.TYPES:
+        array = getattr(found, name)
+        assert array.tobytes() == getattr(one, name).tobytes()
+        assert type(array) is np.ndarray
+        assert not array.flags.owndata  # mapped: it takes no memory of its own
+        assert not array.flags.writeable
+    assert found.to_dict() == one.to_dict()
+    assert lm.verify(target).holds
+    assert lm.verify(target).same_model
+    assert found.simulate(100).to_dict() == one.simulate(100).to_dict()
+    found.save(tmp_path / "again")
+    again = tmp_path / "again/solution.npz"
+    assert again.read_bytes() == (saved / "solution.npz").read_bytes()
+
+
+def test_commands_read_it(target, tmp_path, capsys):
+    for command in (["verify"], ["simulate", "--starts", "50"], ["plot"], ["explain"],
+                    ["export", "--format", "csv", "--out", str(tmp_path / "x.csv")]):  # fmt: skip
+        assert main([command[0], str(target), *command[1:]]) == 0, capsys.readouterr().err
+
+
+def test_a_proof_is_added(target):
+    before = (target / "value.npy").read_bytes()
+    assert main(["prove", str(target), "--time-limit", "0.1"]) in (0, 1)
+    assert names(target) == OURS | {"proof.npz"}
+    assert (target / "value.npy").read_bytes() == before
+    assert lm.verify(target).holds
+
+
+def test_a_save_replaces_it_and_is_replaced(saved, target, tmp_path):
+    lm.solve(made(standard_map(10, 1.01))).save(target)
+    assert names(target) == {"certificate.json", "problem.json", "solution.npz"}
+    put_apart(saved, target)
+    assert names(target) == OURS
+    assert lm.Result.load(target).gamma == lm.Result.load(saved).gamma
+
+
+def test_what_was_begun_is_not_seen_and_can_be_left(saved, target, tmp_path):
+    for place in (target, tmp_path / "new"):
+        begun = writing.Begun(place)
+        begun.path("value.npy").write_bytes(b"half")
+        assert not place.exists() or lm.verify(place).holds
+        begun.abandon()
+    assert names(tmp_path) == {"apart"}
+    assert names(target) == OURS
+
+
+SPOILED = {  # a file of value.npy with right digest
+    "short": lambda b: b[:-1],
+    "long": lambda b: b + b"\0",
+    "empty": lambda b: b"",
+    "text": lambda b: b"value",
+    "pickle": lambda b: content_of(np.array([{}] * 4, dtype=object)),
+    "float32": lambda b: content_of(np.zeros(100, np.float32)),
+    "big-endian": lambda b: content_of(np.zeros(100, ">f8")),
+    "two axes": lambda b: content_of(np.zeros((10, 10))),
+    "header": lambda b: b[:10] + b"{" * (len(b) - 10),
+    "version": lambda b: b[:6] + b"\x02\x00" + b[8:],
+}
+
+
+def content_of(array):
+    import io
+
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("how", SPOILED)
+def test_files_that_are_not_what_they_should_be(saved, tmp_path, how, capsys):
+    held = content(lm.Result.load(saved).value, "<f8")
+    put_apart(saved, tmp_path / "out", value=SPOILED[how](held))
+    assert main(["verify", str(tmp_path / "out")]) == 2
+    assert "value.npy" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", vectors.TYPES)
+def test_a_spoiled_vector_is_refused(saved, tmp_path, name):
+    """With the right digest by what is claimed, else by the digest."""
+    array = getattr(lm.Result.load(saved), name).copy()
+    inside = np.flatnonzero(lm.Result.load(saved).cell_status == 1)
+    array[inside[3]] = array[inside[3]] / 2 if array.dtype.kind == "f" else 0
+    put_apart(saved, tmp_path / "out", **{name: content(array, vectors.TYPES[name])})
+    assert refused(tmp_path / "out")
+    put_apart(saved, tmp_path / "digest")
+    shutil.copy(tmp_path / f"out/{name}.npy", tmp_path / "digest")
+    with pytest.raises(lm.BadInput, match="not the one this result was saved with"):
+        lm.verify(tmp_path / "digest")
+
+
+@posix
+@pytest.mark.parametrize("kind", ["missing", "link", "fifo", "folder"])
+def test_only_regular_files_are_mapped(target, tmp_path, kind):
+    path = target / "value.npy"
+    path.rename(tmp_path / "value.npy")
+    if kind == "link":
+        path.symlink_to(tmp_path / "value.npy")
+    elif kind == "fifo":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    with pytest.raises(lm.BadInput, match=r"value\.npy"):
+        lm.Result.load(target)
+
+
+def test_digests_of_blocks():
+    """By hand: of two blocks, one of them whole."""
+    from hashlib import sha256
+
+    held = bytes(range(256)) * 5000
+    two = sha256(held[: 2**20]).digest() + sha256(held[2**20 :]).digest()
+    assert reading.digest_of("value.npy", held) == "blocks:" + sha256(two).hexdigest()
+    assert reading.digest_of("problem.json", held) == sha256(held).hexdigest()
