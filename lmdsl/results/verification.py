@@ -172,9 +172,8 @@ def verify(
     reasons += proof_findings(path, result, stored.certificate.proof, in_time, notes)
     declared = partial(compile, result.problem, progress, deadline)
     reasons += repaired.differences(result, stored.certificate.proof, declared, lp, judge, deadline)
-    found = Verification(
-        not reasons, result.status, same, certificate, tuple(reasons), tuple(notes)
-    )
+    said = tuple(reasons), tuple(notes)
+    found = Verification(not reasons, result.status, same, certificate, *said)
     system = result.problem.system
     return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
 
