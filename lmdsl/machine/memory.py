@@ -38,8 +38,11 @@ def fits(estimate: float) -> bool:
     return estimate <= SMALL or estimate <= available().bytes
 
 
-def require(estimate: float, what: str) -> None:
-    """Refuse work whose estimate exceeds the available memory, before any of it is taken."""
+def require(estimate: float, what: str, remedy: str = "") -> None:
+    """Refuse work whose estimate exceeds the available memory, before any of it is taken.
+
+    ``remedy`` is what else helps than a smaller problem.
+    """
     if estimate <= SMALL:
         return
     free = available()
@@ -47,6 +50,8 @@ def require(estimate: float, what: str) -> None:
         raise BadInput(
             f"the problem needs about {human(estimate)} of memory ({what}) and {human(free.bytes)} "
             f"are available ({free.limit}); use fewer cells, controls, sample points or noise nodes"
+            + f", {remedy}"
+            * bool(remedy)
         )
 
 

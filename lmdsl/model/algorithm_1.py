@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common import inputs
+from lmdsl.common.on_disk import beside, disk_of
 from lmdsl.common.types import Bools, Indices, Policy
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory, threads
@@ -31,10 +32,11 @@ class Predecessors:
     @classmethod
     def of(cls, rows: Rows) -> Predecessors:
         """Transpose the pattern of rows."""
-        memory.require(8 * len(rows.target) + 16 * rows.columns + 8 * rows.count, "predecessors")
+        large = 0 if disk_of(rows.target) else 8 * len(rows.target)
+        memory.require(large + 16 * rows.columns + 8 * rows.count, "predecessors")
         pointer = np.zeros(rows.columns + 2, dtype=np.int64)
         small = rows.count < 2**31
-        pair = np.empty(len(rows.target), dtype=np.int32 if small else np.int64)
+        pair = beside(rows.target, len(rows.target), np.int32 if small else np.int64)
         _transpose(rows.pointer, rows.target, pointer, pair)
         return cls(pointer, pair)
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common import inputs
+from lmdsl.common.on_disk import Disk
 from lmdsl.common.records import Frozen, freeze
 from lmdsl.common.types import FilePath, Floats, Indices, Progress, Statuses, told
 from lmdsl.errors import BadInput
@@ -106,9 +107,7 @@ class StabilizationLP(Frozen):
     @cached_property
     def cell(self) -> NDArray[np.int32]:
         """The cell of every column as a position in ``cells``, shape (K,)."""
-        cell = algorithm_1.owner(self.pair_pointer)
-        freeze(cell)
-        return cell
+        return fixed(algorithm_1.owner(self.pair_pointer))
 
     @property
     def A(self) -> Any:
@@ -258,6 +257,7 @@ class StabilizationLP(Frozen):
 def compile(  # noqa: A001
     problem: Problem | FilePath, progress: Progress | bool | None = None,
     time_limit: float | Deadline | None = None, *, dropped: Any = None,
+    rows_on_disk: FilePath | None = None,
 ) -> StabilizationLP:  # fmt: skip
     """Compile a problem: transitions, stabilizable set and the LP on it.
 
@@ -271,6 +271,8 @@ def compile(  # noqa: A001
         Seconds. What takes a moment is compiled whatever the limit.
     dropped
         Pairs (cell, control) to leave out, shape (D, 2).
+    rows_on_disk
+        A folder: the rows lie there, in files that vanish with the LP, instead of in memory.
 
     Raises
     ------
@@ -279,11 +281,10 @@ def compile(  # noqa: A001
     BadInput
         A set has no cells, a cost is negative or not finite, or memory does not suffice.
     """
-    progress = told(progress)
-    deadline = Deadline.of(time_limit)
+    progress, deadline = told(progress), Deadline.of(time_limit)
     problem = settled(given(problem), deadline)
     partition = Partition.of(problem)
-    require_least(problem)
+    require_least(problem, disk := Disk.of(rows_on_disk))
     limit = unless_short(problem, deadline)
     declared = CellSets.of(problem, partition, limit)
     if problem.local_controller is not None:  # refuse a wrong one before the work
@@ -291,30 +292,28 @@ def compile(  # noqa: A001
     hold = holding.held(problem, partition, declared, limit)
     sets, empty = holding.within(declared, problem, hold), holding.leaves_nothing(problem, hold)
     make = holding.no_pairs if empty else assemble
-    transitions = make(problem, partition, progress, deadline, sets)
+    transitions = make(problem, partition, progress, deadline, sets, disk=disk)
     successors = Successors.asked_for(problem, partition, transitions, deadline, progress)
     controls = control_vectors(problem)
     pairs, left = left_out(dropped, transitions, len(controls))
     found = stabilizable_set.of_problem(problem, transitions, deadline, successors, left)
-    kept, pair_pointer, rows = stabilizable_set.restrict(transitions, found)
-    cells, policy = sets.free[found.inside], found.pair[found.inside]  # by Algorithm 1
-    column = policy if isinstance(kept, slice) else np.searchsorted(kept, policy)
+    own, cells = stabilizable_set.restrict(transitions, found), sets.free[found.inside]
     lp = StabilizationLP(
         problem=problem,
         partition=partition,
         controls=controls,
         cell_status=stabilizable_set.statuses(transitions, found, empty),
         cells=cells,
-        pair_pointer=pair_pointer,
-        control=transitions.control[kept],
-        rows=rows,
-        cost=transitions.cost[kept],
+        pair_pointer=own.pair_pointer,
+        control=own.control,
+        rows=own.rows,
+        cost=own.cost,
         gamma=problem.gamma,
         weight=sets.weight(cells),
         sure_levels=None if successors is None else successors.sure_levels(),
         hold=hold,
         dropped=pairs,
-        _known=(found.level[found.inside], column),
+        _known=(found.level[found.inside], own.first),
     )
     freeze(*(x.base for x in (lp.controls, lp.control, lp.cost) if isinstance(x.base, np.ndarray)))
     return lp

@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.html import facts
-from lmdsl.common.types import Bools, Indices, Statuses
+from lmdsl.common.on_disk import disk_of, empty, taken
+from lmdsl.common.types import Bools, Floats, Indices, Statuses
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import kernel
@@ -188,25 +189,41 @@ def _choices(transitions: Transitions, admissible: Bools | None) -> Indices:
     return np.bincount(cells, minlength=len(transitions.sets.free))
 
 
-def restrict(
-    transitions: Transitions, found: Stabilizable
-) -> tuple[Indices | slice, Indices, Rows]:
-    """Keep the surviving pairs and number the cells of C.
+@dataclass(frozen=True, eq=False)
+class Survivors:
+    """The surviving pairs, by cells of C.
 
-    Returns
-    -------
-    kept : pair indices that survive, ascending, or the slice of all
-    pair_pointer : pairs by cell of C
-    rows : their rows, targets numbering the cells of C, |C| for the attractor
+    Attributes
+    ----------
+    pair_pointer
+        Pairs by cell of C.
+    control, cost
+        Of every pair.
+    rows
+        Targets number the cells of C, |C| stands for the attractor.
+    first
+        The pair of every cell of C by Algorithm 1.
     """
-    rows = transitions.rows
-    n = int(found.inside.sum())
+
+    pair_pointer: Indices
+    control: NDArray[np.int32]
+    cost: Floats
+    rows: Rows
+    first: Indices
+
+
+def restrict(transitions: Transitions, found: Stabilizable) -> Survivors:
+    """Keep the surviving pairs and number the cells of C."""
+    rows, control, cost = transitions.rows, transitions.control, transitions.cost
+    n, first = int(found.inside.sum()), found.pair[found.inside]
     if n == rows.columns and found.surviving.all():
-        return slice(None), transitions.pair_pointer, rows
-    share = int(found.surviving.sum()) / max(rows.count, 1)
+        every = control[:], cost[:]  # views: who holds the transitions keeps arrays of its own
+        return Survivors(transitions.pair_pointer, *every, rows, first)
+    count, disk = int(found.surviving.sum()), disk_of(rows.target)
     row = len(rows.target) / max(rows.count, 1) * (4 + rows.code.itemsize)
-    memory.require(share * rows.count * (28 + row), "the pairs of the stabilizable set")
-    kept = np.flatnonzero(found.surviving)
+    if disk is None:
+        memory.require(count * (28 + row), "the pairs of the stabilizable set")
+    kept = empty(disk, count, np.int64)
     per_cell = np.add.reduceat(
         np.append(found.surviving, False), transitions.pair_pointer[:-1], dtype=np.int64
     )
@@ -215,11 +232,15 @@ def restrict(
     renumber = np.full(rows.columns + 1, -1, dtype=np.int32)
     renumber[np.flatnonzero(found.inside)] = np.arange(n, dtype=np.int32)
     renumber[rows.columns] = n
-    pointer = np.zeros(len(kept) + 1, dtype=np.int64)
-    entries = _ends(found.surviving, rows.pointer, pointer)
-    target, code = np.empty(entries, dtype=np.int32), np.empty(entries, dtype=rows.code.dtype)
+    pointer = empty(disk, count + 1, np.int64)
+    pointer[0] = 0
+    entries = _ends(found.surviving, rows.pointer, kept, pointer)
+    target, code = empty(disk, entries, np.int32), empty(disk, entries, rows.code.dtype)
     _keep(found.surviving, rows.pointer, rows.target, rows.code, renumber, target, code)
-    return kept, pair_pointer, Rows(pointer, target, code, rows.shares, n)
+    return Survivors(
+        pair_pointer, taken(control, kept), taken(cost, kept),
+        Rows(pointer, target, code, rows.shares, n), np.searchsorted(kept, first),
+    )  # fmt: skip
 
 
 @kernel(allocates=True)
@@ -250,11 +271,12 @@ def _remove(lost, pointer, pair, cell, pair_pointer, alive, inside, choices):  #
 
 
 @kernel
-def _ends(kept, pointer, ends):  # type: ignore[no-untyped-def]
-    """Write the ends of the rows that are kept, one after the other; return the last."""
+def _ends(kept, pointer, number, ends):  # type: ignore[no-untyped-def]
+    """Write the numbers of the rows that are kept, and their ends; return the last end."""
     row = end = 0
     for k in range(len(kept)):
         if kept[k]:
+            number[row] = k
             row, end = row + 1, end + pointer[k + 1] - pointer[k]
             ends[row] = end
     return end

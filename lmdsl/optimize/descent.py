@@ -16,6 +16,7 @@ from lmdsl.certificate.bounds import (
 from lmdsl.certificate.sums import UNIT as UNIT
 from lmdsl.certificate.sums import rounded_down
 from lmdsl.certificate.vectors import over_cells, padded
+from lmdsl.common.on_disk import filled
 from lmdsl.common.types import Floats, TimeUp, never
 from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
@@ -28,7 +29,7 @@ def backup_below(lp: StabilizationLP, x: Floats, gamma: float, cost: Floats | No
     """Return a lower bound of min_a gamma P_a x + G_a, shape (n,); ``cost`` None means 0."""
     if cost is None and ordinary(lp, x, gamma, None):  # the margin of the longest row for all
         terms = int(np.diff(lp.rows.pointer).max(initial=0)) + 8
-        least: Floats = improve(lp, x, gamma, np.zeros(lp.K)).value
+        least: Floats = improve(lp, x, gamma, filled(lp.cost, 0.0)).value
         return least * (1 - terms * UNIT) * (1 - 4 * UNIT)
     lower, V = np.empty(lp.n), padded(lp, x)
     cost, plain = np.empty(0) if cost is None else cost, never_underflows(lp, V, gamma)

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lmdsl.common.on_disk import Disk, beside, taken
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.substeps import settled
@@ -25,7 +26,9 @@ from lmdsl.slabs.graph import levels
 from lmdsl.slabs.graph.pairs import OwnPairs, assembled
 
 
-def compiled(ranks: Ranks, problem: Problem, deadline: Deadline | None = None) -> StabilizationLP:
+def compiled(
+    ranks: Ranks, problem: Problem, deadline: Deadline | None = None, disk: Disk | None = None
+) -> StabilizationLP:
     """Return the LP of the own cells of C; collective.
 
     Its ``cell_status`` is that of the own part of the box: from the first own free cell to that of
@@ -34,7 +37,7 @@ def compiled(ranks: Ranks, problem: Problem, deadline: Deadline | None = None) -
     deadline = Deadline.of(deadline)
     problem = ranks.agreed(lambda: settled(problem, deadline))
     partition = ranks.agreed(lambda: Partition.of(problem))
-    pairs = assembled(ranks, problem, partition, deadline)
+    pairs = assembled(ranks, problem, partition, deadline, disk)
     rows = pairs.rows if problem.ends_in_time else pairs.rows.without_end()
     found = levels.stabilizable(pairs.mesh, pairs.pair_pointer, rows, deadline)
     inside = found.inside[: pairs.mesh.own]
@@ -50,9 +53,9 @@ def compiled(ranks: Ranks, problem: Problem, deadline: Deadline | None = None) -
         cell_status=_statuses(pairs, found),
         cells=cells,
         pair_pointer=np.append(0, np.cumsum(per_cell)).astype(np.int64),
-        control=pairs.control[kept],
+        control=taken(pairs.control, kept),
         rows=own,
-        cost=pairs.cost[kept],
+        cost=taken(pairs.cost, kept),
         gamma=problem.gamma,
         weight=_weight(ranks, pairs.sets, cells),
         mesh=mesh,
@@ -70,9 +73,13 @@ def _restricted(pairs: OwnPairs, found: Stabilizable) -> tuple[Mesh, Indices | s
     number = np.full(before.own, -1, dtype=np.int64)
     number[inside] = division.own(before.ranks.rank)[0] + np.arange(inside.sum())
     numbers = before.spread(number, division.cells)
-    pointer = np.zeros(int(found.surviving.sum()) + 1, dtype=np.int64)
-    entries = _ends(found.surviving, rows.pointer, pointer)
-    target, code = np.empty(entries, dtype=np.int32), np.empty(entries, dtype=rows.code.dtype)
+    count = int(found.surviving.sum())
+    kept_pairs = beside(rows.target, count, np.int64)
+    pointer = beside(rows.target, count + 1, np.int64)
+    pointer[0] = 0
+    entries = _ends(found.surviving, rows.pointer, kept_pairs, pointer)
+    target = beside(rows.target, entries, np.int32)
+    code = beside(rows.target, entries, rows.code.dtype)
     same = np.arange(before.columns + 1, dtype=np.int32)
     _keep(found.surviving, rows.pointer, rows.target, rows.code, same, target, code)
     used = np.zeros(before.columns + 1, dtype=np.bool_)
@@ -81,8 +88,8 @@ def _restricted(pairs: OwnPairs, found: Stabilizable) -> tuple[Mesh, Indices | s
     mesh = Mesh.of(before.ranks, division, numbers[named])
     local = np.full(before.columns + 1, -1, dtype=np.int32)
     local[named] = mesh.local(numbers[named])
-    kept = Rows(pointer, local[target], code, rows.shares, mesh.columns)
-    return mesh, np.flatnonzero(found.surviving), kept
+    kept = Rows(pointer, taken(local, target), code, rows.shares, mesh.columns)
+    return mesh, kept_pairs, kept
 
 
 def _statuses(pairs: OwnPairs, found: Stabilizable) -> Statuses:

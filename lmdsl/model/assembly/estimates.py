@@ -5,6 +5,8 @@ import math
 import time
 from typing import NamedTuple
 
+from lmdsl.common.on_disk import WHERE, Disk
+from lmdsl.errors import BadInput
 from lmdsl.machine import memory, threads
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.progress import spoken
@@ -17,9 +19,50 @@ from lmdsl.problem.problem import Problem
 log = logging.getLogger(__name__)
 
 
-def require_least(problem: Problem) -> None:
+def require_least(problem: Problem, disk: Disk | None = None) -> None:
     """Refuse a problem whose grids and cells do not fit, before anything of it is made."""
-    memory.require(estimate(problem), named(problem, "at least, before sampling"))
+    require_room(problem, "at least, before sampling", disk)
+
+
+def require_room(
+    problem: Problem,
+    how: str,
+    disk: Disk | None = None,
+    pilot: "Pilot | None" = None,
+    share: float = 1.0,
+) -> int:
+    """Return the bytes of memory that a share of a problem takes; refuse what does not fit.
+
+    Where its rows on disk would make it fit, the refusal says so, and how much they take there.
+    """
+    pilot = pilot or ALL_ADMISSIBLE
+    need, rows = (int(each * share) for each in (estimate(problem, pilot, disk is not None),
+                                                 of_rows(problem, pilot)))  # fmt: skip
+    if disk is not None:
+        disk.require(rows)
+        memory.require(need, f"{named(problem, how)}, rows on disk")
+    else:
+        less = int(estimate(problem, pilot, True) * share)
+        memory.require(need, named(problem, how), _remedy(less, rows))
+    return need
+
+
+def _remedy(need: int, rows: int) -> str:
+    """Return what rows on disk would change, where that is enough."""
+    if not memory.fits(need):
+        return ""
+    return (
+        "or keep rows on disk (lmdsl solve --rows-on-disk DIR, in Python rows_on_disk=DIR), which "
+        f"takes {memory.human(need)} of memory and {memory.human(rows)} there"
+    )
+
+
+def refuse_given(disk: Disk | None) -> None:
+    """Refuse a disk for rows that are given, in memory."""
+    if disk is not None:
+        raise BadInput(
+            "the rows of this problem are given, in memory, and not computed; leave it out", WHERE
+        )
 
 
 def named(problem: Problem, how: str) -> str:
@@ -40,30 +83,52 @@ class Pilot(NamedTuple):
 ALL_ADMISSIBLE = Pilot()
 
 
-def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
-    """Return an upper bound of the bytes that compiling and solving a problem takes.
+def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE, on_disk: bool = False) -> int:
+    """Return an upper bound of the bytes of memory that compiling and solving a problem takes.
 
     Solving is counted for the default backend, as it goes as a rule. What takes more (cells that
     are lost, ties, other backends, a first policy that is hard to find) asks when it comes to it.
     """
-    # Capped: a product of declared counts may exceed the range of doubles.
-    N = min(math.prod(axis.cells for axis in problem.state_box.values()), 10**40)
-    M = min(discretization.control_count(problem), 10**40)
-    S = min(discretization.sample_points(problem) * discretization.node_count(problem), 10**40)
-    entry = 4 + (1 if S <= 2**8 else 2 if S <= 2**16 else 4)
+    N, M, S = _counts(problem)
     pairs = M * pilot.admissible
-    # Of a pair the row, its end, control and cost; of a cell the sets, levels and weights.
     entries = pilot.entries + (problem.discount is not None)
-    model = N * (64 + pairs * (21 + entries * entry))
+    # Of a pair the row, its end, control and cost; of a cell the sets, levels and weights.
+    row = 0.0 if on_disk else 20 + entries * _entry(S)
+    model = N * (64 + pairs * (1 + row))
     if problem.successors == "enclosed":
         parts = min(discretization.node_count(problem), 10**40)
         model += N * pairs * (8 + 4 * parts * len(problem.state_box))
-    copied = pairs * (28 + entries * entry) if pilot.admissible < 1 else 0  # cells may be lost
+    copied = pairs * (8 + row) if pilot.admissible < 1 else 0  # cells may be lost
     # Of a pair whether it ties, and a unit cost; of a cell vectors, and the rows of a policy in
     # doubles.
-    solving = pairs * 9 + 130 + 24 * entries
+    solving = pairs * (1 if on_disk else 9) + 130 + 24 * entries
     peak = MARGIN * (model + max(N * copied + _blocks(problem, S), N * solving))
     return int(min(peak + _grids(problem, M, S) + OVERHEAD, 1e30))
+
+
+def of_rows(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
+    """Return an upper bound of the bytes that rows take on disk."""
+    N, M, S = _counts(problem)
+    entries = pilot.entries + (problem.discount is not None)
+    each = 20 + entries * _entry(S)
+    if pilot.admissible < 1:  # cells may be lost: a copy, and who reaches each cell
+        each += max(each + 8, 8 * entries)
+    return int(min(MARGIN * N * M * pilot.admissible * each, 1e30))
+
+
+def _counts(problem: Problem) -> tuple[int, int, int]:
+    """Return the numbers of cells, controls and samples.
+
+    Capped: a product of declared counts may exceed the range of doubles.
+    """
+    N = math.prod(axis.cells for axis in problem.state_box.values())
+    S = discretization.sample_points(problem) * discretization.node_count(problem)
+    return min(N, 10**40), min(discretization.control_count(problem), 10**40), min(S, 10**40)
+
+
+def _entry(S: int) -> int:
+    """Return the bytes of a target and its code."""
+    return 4 + (1 if S <= 2**8 else 2 if S <= 2**16 else 4)
 
 
 MARGIN = 1.1  # a few cells do not say exactly what all are like, and allocators keep something back

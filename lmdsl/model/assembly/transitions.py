@@ -16,16 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common.on_disk import Disk, growing
 from lmdsl.common.types import Floats, Guard, Indices, Progress
 from lmdsl.errors import BadInput
-from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.estimates import (
     Outlook,
     Pilot,
-    estimate,
-    named,
+    refuse_given,
     require_least,
+    require_room,
     unless_short,
 )
 from lmdsl.model.assembly.merging import BlockRows, Numbering, merge, merge_one, tile
@@ -62,31 +62,34 @@ def assemble(
     sets: CellSets | None = None,
     way: CellSets | None = None,
     span: tuple[int, int] | None = None,
+    disk: Disk | None = None,
 ) -> Transitions:
     """Build the rows of every admissible pair.
 
     ``sets`` are the problem's, where they are known, and ``way`` those that judge what steps meet
     on their way, and what they pay at its end, where these are others. ``span`` are the first free
     cell whose pairs are asked for, and the one after the last, by their positions; default all.
-    They are the same rows as among all: blocks of cells do not depend on what is asked for.
+    They are the same rows as among all: blocks of cells do not depend on what is asked for. On a
+    ``disk`` the arrays of pairs and rows lie there instead of in memory.
 
     TimeLimitReached: the deadline has passed, and it was more than a moment's work. BadInput: the
     problem does not fit in memory, or the stage cost of an admissible pair is negative or not
     finite at a sample.
     """
-    require_least(problem)
+    require_least(problem, disk)
     deadline = unless_short(problem, Deadline.of(deadline))
     sets = sets or CellSets.of(problem, partition, deadline)
     if isinstance(problem.system, MatrixSystem):
         from lmdsl.model.assembly.given import cut, of_matrices  # which make what stands here
 
+        refuse_given(disk)
         return cut(of_matrices(problem, partition, sets), span)
     sampler = Sampler(problem, partition, deadline, sets=way or sets)
     try:
         with sampler.asked.helped():
             sampler.audit(sets.free)
             asked = (0, len(sets.free)) if span is None else span
-            return _assembled(problem, sets, sampler, progress, deadline, asked)
+            return _assembled(problem, sets, sampler, progress, deadline, asked, disk)
     except BaseException:
         deadline.cancel()  # threads that help may be far from the end of their blocks
         raise
@@ -99,19 +102,20 @@ def _assembled(
     progress: Progress | None,
     deadline: Deadline,
     span: tuple[int, int],
+    disk: Disk | None,
 ) -> Transitions:
     pilot = _pilot(sampler, sets)
     F, M = span[1] - span[0], len(sampler.controls)
-    need = estimate(problem, pilot) * F // max(len(sets.free), 1)
-    memory.require(need, named(problem, "estimated from a few cells"))
+    share = F / max(len(sets.free), 1)
+    need = require_room(problem, "estimated from a few cells", disk, pilot, share)
     guard = partial(deadline.raise_if_over, "compiling")
     shares = shares_of(problem, len(sampler.points), sampler.nodes, guard)
     pairs = int(F * M * min(1.0, 1.05 * pilot.admissible)) + M
     capacity = int(pairs * (1.05 * pilot.entries + (shares.ended is not None))) + sampler.samples
-    pointer, control = _Growing(np.int64, pairs + 1), _Growing(np.int32, pairs)
-    cost = _Growing(np.float64, pairs)
-    target = _Growing(np.int32, capacity)
-    code = _Growing(code_type(len(shares.numerator)), capacity)
+    pointer, control = growing(disk, np.int64, pairs + 1), growing(disk, np.int32, pairs)
+    cost = growing(disk, np.float64, pairs)
+    target = growing(disk, np.int32, capacity)
+    code = growing(disk, code_type(len(shares.numerator)), capacity)
     pair_pointer = np.zeros(F + 1, dtype=np.int64)
     pointer.append(np.zeros(1, dtype=np.int64))
     done, outlook = 0, Outlook("compiling and solving take", need, pairs * pilot.entries)
@@ -279,27 +283,3 @@ def _refuse_cost(sampler: Sampler, cell: int, control: int) -> None:
             key,
         )
     raise BadInput("the mean of the samples overflows; scale the cost down", "stage_cost")
-
-
-class _Growing:
-    """An array that grows by reallocation, so that no second copy of it ever exists.
-
-    Capacity that is never used is never touched: it takes addresses, not memory.
-    """
-
-    def __init__(self, dtype: Any, capacity: int) -> None:
-        self.data = np.empty(capacity, dtype=dtype)
-        self.used = 0
-
-    def append(self, part: NDArray[Any]) -> None:
-        end = self.used + len(part)
-        if end > len(self.data):
-            more = int(1.1 * end) - len(self.data)
-            memory.require(more * self.data.itemsize, "rows longer than those of a few cells")
-            self.data.resize(int(1.1 * end), refcheck=False)
-        self.data[self.used : end] = part
-        self.used = end
-
-    def array(self) -> NDArray[Any]:
-        self.data.resize(self.used, refcheck=False)
-        return self.data

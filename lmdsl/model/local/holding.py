@@ -144,9 +144,9 @@ def leaves_nothing(problem: Problem, index: Controls | None) -> bool:
 
 def no_pairs(
     problem: Problem, partition: Partition, progress: Progress | None, deadline: Deadline | None,
-    sets: CellSets,
+    sets: CellSets, disk: Any = None,
 ) -> Transitions:  # fmt: skip
-    """Return transitions without a pair."""
+    """Return transitions without a pair, which take no room on a disk."""
     F, nothing = len(sets.free), np.zeros(0, dtype=np.int32)
     shares = shares_of(problem, sample_points(problem), noise_nodes(problem))
     rows = Rows(np.zeros(1, dtype=np.int64), nothing, nothing.astype(np.uint8), shares, F)

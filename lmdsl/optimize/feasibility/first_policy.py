@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lmdsl.certificate import bounds
+from lmdsl.common.on_disk import filled
 from lmdsl.common.types import Floats, Policy, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
@@ -118,7 +119,7 @@ def _raising(lp: StabilizationLP, time_up: TimeUp) -> Iterator[Feasible | Refuse
         yield swept
         return
     level, policy = lp._algorithm_1
-    unit, asked = np.ones(lp.K), lp.growth == 1
+    unit, asked = filled(lp.cost, 1.0), lp.growth == 1
     for horizon in (4.0 * level.max(), 64.0 * level.max()):
         at, value = 1 - 1 / horizon, np.full(lp.n, horizon)
         for _ in range(4):

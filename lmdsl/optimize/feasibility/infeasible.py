@@ -5,6 +5,7 @@ from contextlib import suppress
 import numpy as np
 
 from lmdsl.certificate import bounds
+from lmdsl.common.on_disk import filled
 from lmdsl.common.types import Bools, Floats, Policy, TimeUp
 from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.kernels import kernel
@@ -42,7 +43,7 @@ def exhausted_by_levels(lp: StabilizationLP) -> Policy | None:
 
 def _climbed(lp: StabilizationLP, start: PolicyClasses, time_up: TimeUp) -> PolicyClasses:
     """Improve a policy under unit cost just below its limit, where its value fits into doubles."""
-    unit = np.ones(lp.K)
+    unit = filled(lp.cost, 1.0)
     for below in (1e-3, 0.1):
         at = start.limit * (1 - below)
         value = evaluation.evaluate(lp, start.policy, at, unit, time_up=time_up)

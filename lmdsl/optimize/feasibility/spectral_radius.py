@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from lmdsl.certificate import bounds
+from lmdsl.common.on_disk import filled
 from lmdsl.common.types import Bools, Floats, Indices, Policy, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.machine.forking import cached_property
@@ -113,12 +114,12 @@ def short_lived(lp: StabilizationLP, time_up: TimeUp = never) -> PolicyClasses:
     horizon = float(HORIZON * level.max())
 
     def candidates() -> Iterator[tuple[Policy, Floats | None]]:
-        w, zero = level.astype(np.float64), np.zeros(lp.K)
+        w, zero = level.astype(np.float64), filled(lp.cost, 0.0)
         for _ in range(PASSES):
             done = bellman.improve(lp, w, 1.0, zero)
             w = done.value
         yield done.policy, None
-        unit, value = np.ones(lp.K), np.full(lp.n, horizon)
+        unit, value = filled(lp.cost, 1.0), np.full(lp.n, horizon)
         found = iteration.iterate(lp, policy, value, 1 - 1 / horizon, unit, time_up=time_up)
         yield found.policy, found.value
         yield policy, None
@@ -215,7 +216,7 @@ def _greedy(
 ) -> PolicyClasses | None:
     """Return the policy that is better for the w of another, None where none is."""
     w = w if inside is None else np.where(inside, w, 0.0)
-    best = bellman.improve(lp, w, 1.0, np.zeros(lp.K))
+    best = bellman.improve(lp, w, 1.0, filled(lp.cost, 0.0))
     change = best.value < (found.P @ w) * (1 - SLIGHT)
     if not change.any():
         return None

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lmdsl.common.on_disk import filled
 from lmdsl.common.types import Bools, Floats, Policy, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
@@ -67,7 +68,7 @@ class _Asked(NamedTuple):
 
 def _stopping(asked: _Asked, policy: Policy, going: Bools, limit: int) -> Stopping:
     lp, gamma, reward, time_up = asked
-    zero = np.zeros(lp.K)
+    zero = filled(lp.cost, 0.0)
     w = _stopped(asked, policy, going, reward)
     if w is None:
         going = np.zeros(lp.n, dtype=np.bool_)

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common.on_disk import Disk
 from lmdsl.common.types import Floats, Indices
 from lmdsl.errors import BadInput
 from lmdsl.machine.deadline import Deadline
@@ -67,7 +68,11 @@ def require_supported(problem: Problem) -> None:
 
 
 def assembled(
-    ranks: Ranks, problem: Problem, partition: Partition, deadline: Deadline | None = None
+    ranks: Ranks,
+    problem: Problem,
+    partition: Partition,
+    deadline: Deadline | None = None,
+    disk: Disk | None = None,
 ) -> OwnPairs:
     """Return the own pairs of this rank; collective. Raises what :func:`assemble` does."""
     from lmdsl import __version__
@@ -82,7 +87,7 @@ def assembled(
     division = ranks.agreed(lambda: divided(problem, partition, sets, ranks.count, deadline))
     span = division.own(ranks.rank)
     own = ranks.agreed(
-        lambda: assemble(problem, partition, deadline=deadline, sets=sets, span=span)
+        lambda: assemble(problem, partition, deadline=deadline, sets=sets, span=span, disk=disk)
     )
     mesh = Mesh.of(ranks, division, own.rows.target)
     given = isinstance(problem.system, MatrixSystem)
