@@ -30,6 +30,7 @@ OPTIONS = (
     "require_all",
     "restrict_to_gamma",
     "proved",
+    "rows_on_disk",
 )
 # Runs of the true map that follow a solve: how many, how long, and how long all together.
 STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
@@ -48,6 +49,8 @@ def add(command: Command) -> None:
                        help="solve on the cells for which gamma is feasible")  # fmt: skip
     solve.add_argument("--proved", type=float, metavar="T",
                        help="repair until this share of cells is proved to arrive")  # fmt: skip
+    solve.add_argument("--rows-on-disk", metavar="DIR",
+                       help="keep the rows in files of DIR instead of memory")  # fmt: skip
     solve.add_argument("--out", metavar="DIR", help="write controller and certificate to DIR")
     solve.add_argument("--no-simulate", dest="simulate", action="store_false",
                        help="make no runs of the true map")  # fmt: skip

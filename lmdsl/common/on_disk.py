@@ -126,7 +126,7 @@ class Growing(Protocol):
 
 def growing(disk: Disk | None, dtype: Any, capacity: int) -> Growing:
     """Return an array that grows, in memory or on disk; ``capacity`` is about its last length."""
-    return _InMemory(dtype, capacity) if disk is None else _Written(disk, dtype)
+    return _InMemory(dtype, capacity) if disk is None else _OnDisk(disk, dtype)
 
 
 class _InMemory:
@@ -153,12 +153,15 @@ class _InMemory:
         return self.data
 
 
-class _Written:
+class _OnDisk:
     """An array that grows by writing to its file, which is mapped once it is complete."""
 
     def __init__(self, disk: Disk, dtype: Any) -> None:
         self.disk, self.dtype = disk, dtype
         self.file, self.used = disk.file(), 0
+
+    def __del__(self) -> None:
+        self.file.close()  # of work that was broken off
 
     def append(self, part: NDArray[Any]) -> None:
         try:

@@ -14,6 +14,7 @@ from lmdsl.backends.asking import ask
 from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Verified, Witness
 from lmdsl.common import inputs
+from lmdsl.common.on_disk import WHERE
 from lmdsl.common.types import FilePath, Progress, told
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
@@ -42,6 +43,7 @@ def solve(
     restrict_to_gamma: bool = False,
     proved: float | None = None,
     start: Result | None = None,
+    rows_on_disk: FilePath | None = None,
     progress: Progress | bool | None = None,
 ) -> Result:
     """Solve a problem and verify the answer.
@@ -72,6 +74,8 @@ def solve(
     start
         An earlier result of the same states and controls, on other cells, with other samples or
         another gamma, say: the search begins at its controller. The answer is the same.
+    rows_on_disk
+        A folder: the rows lie there, in files that vanish with the result, instead of in memory.
     progress
         Called with (stage, fraction done, or -1); True shows it on stderr, with the time left.
 
@@ -89,6 +93,7 @@ def solve(
     progress = told(progress)
     problem = given(problem, StabilizationLP)
     _check_options(tolerance, max_iterations)
+    _not_compiled_yet(problem, rows_on_disk)
     require_all = inputs.flag(require_all, "require_all")
     restrict_to_gamma = inputs.flag(restrict_to_gamma, "restrict_to_gamma")
     if restrict_to_gamma:
@@ -104,6 +109,7 @@ def solve(
         require_all=require_all,
         restrict_to_gamma=restrict_to_gamma,
         start=_earlier(start),
+        rows_on_disk=rows_on_disk,
         progress=progress,
     )
     if proved is None:
@@ -126,7 +132,10 @@ def _solved(problem: Problem | StabilizationLP, request: "_Request", dropped: An
         return _answer(problem, request)
     started = time.perf_counter()
     try:
-        lp = compile(problem, request.progress, request.deadline, dropped=dropped)
+        lp = compile(
+            problem, request.progress, request.deadline,
+            dropped=dropped, rows_on_disk=request.rows_on_disk,
+        )  # fmt: skip
     except TimeLimitReached as error:
         seconds = time.perf_counter() - started
         return not_compiled(request.name, problem, request.tolerance, error, seconds)
@@ -146,6 +155,7 @@ class _Request:
     require_all: bool
     restrict_to_gamma: bool
     start: lifting.Earlier | None
+    rows_on_disk: FilePath | None
     progress: Progress | None
 
     def first(
@@ -241,6 +251,11 @@ def _check_options(tolerance: Any, max_iterations: Any) -> None:
         raise BadInput(f"{shown(tolerance)} must be a finite number >= 0", "tolerance")
     if max_iterations is not None:
         inputs.whole(max_iterations, "max_iterations", most=math.inf)
+
+
+def _not_compiled_yet(problem: Problem | StabilizationLP, rows_on_disk: Any) -> None:
+    if rows_on_disk is not None and isinstance(problem, StabilizationLP):
+        raise BadInput("the problem is compiled already; give it to lm.compile", WHERE)
 
 
 def _earlier(start: Any) -> lifting.Earlier | None:

@@ -11,7 +11,6 @@ threads and appended in order, so the rows do not depend on the number of thread
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
