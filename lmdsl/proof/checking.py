@@ -11,6 +11,7 @@ import numpy as np
 
 from lmdsl.common.types import Bools, Guard, Indices
 from lmdsl.machine import memory
+from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.boxes import named
 from lmdsl.model.stabilizable_set import CellStatus
@@ -51,7 +52,8 @@ def faults(loop: Loop, arrays: Arrays, guard: Guard, entry: Bools | None = None)
     In ``entry``, shape (N,), the attractor cells are marked that what arrives can enter.
     """
     partition, count = loop.partition, len(arrays["cell"])
-    images = loop.images()
+    guard()
+    images = loop.images(whole=loop.whole(Deadline()))
     each = node_bytes(partition.dimension, len(images.noise[0]))
     memory.require(each * (2.0 * count + partition.size), "the boxes of the proof")
     wrong = malformed(loop, arrays)

@@ -53,7 +53,7 @@ def prove(
     attractor cells that what arrives can enter. Where ``ending`` ends it, bounds are not tightened.
     """
     began = time.monotonic()
-    images, partition = loop.images(SLACK), loop.partition
+    images, partition = loop.images(SLACK, loop.whole(deadline)), loop.partition
     each = node_bytes(partition.dimension, len(images.noise[0]))
     memory.require(3.0 * each * partition.size, "the boxes of the proof")
     whole, left = deadline, deadline.left

@@ -13,6 +13,7 @@ from lmdsl.model.successors.compiled import enclosing, places, tapes
 from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 from lmdsl.proof.images.pieces import DEEPEST, Integers, Pieces, pieces
+from lmdsl.proof.images.whole import WholeCells
 
 SOME = 2**13  # most boxes enclosed at a time by a thread
 KEPT = 2**22  # doubles of paths above which fewer boxes are enclosed at a time
@@ -57,13 +58,15 @@ class BoxImages:
         The controls of the cells, shape (N, p); any where there is none.
     slack
         By how much images are widened, in cells.
+    whole
+        What is known of the images of whole cells.
     """
 
     def __init__(
         self, problem: Problem, partition: Partition, status: Statuses, control: Floats,
-        slack: float = 0.0,
+        slack: float = 0.0, whole: WholeCells | None = None,
     ) -> None:  # fmt: skip
-        self.problem, self.partition = problem, partition
+        self.problem, self.partition, self.whole = problem, partition, whole
         self.control, self.slack = control, slack
         self.step = tapes.step(problem)
         self.noise = noise_parts(problem)
@@ -100,13 +103,15 @@ class BoxImages:
         held, stretch = enclosing.rows(self.step), np.zeros((count, d))
         located: list[Indices] = []
         besides: list[Integers] = []
-        for least, most in zip(*self.noise, strict=True):
+        for part, (least, most) in enumerate(zip(*self.noise, strict=True)):
             given = enclosing.Given(
                 boxes.low, boxes.high, self.control[cell[boxes.owner]],
                 *(np.broadcast_to(ends, (count, len(ends))) for ends in (least, most)),
             )  # fmt: skip
             found = enclosing.enclose(self.step, given, held)
             image, more = self._located(boxes, found)
+            if self.whole is not None:
+                self.whole.narrow(cell[boxes.owner], part, image, more)
             located.append(image)
             besides.append(more)
             np.bitwise_or.at(flags, boxes.owner, more)
