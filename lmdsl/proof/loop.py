@@ -13,7 +13,7 @@ from lmdsl.problem.problem import Problem
 from lmdsl.proof.bounds.optimum.moves import Game
 from lmdsl.proof.images.pieces import pieces
 from lmdsl.proof.images.seen import BoxImages
-from lmdsl.proof.images.whole import WholeCells
+from lmdsl.proof.images.whole import CellRanges
 
 
 class Loop(NamedTuple):
@@ -59,13 +59,13 @@ class Loop(NamedTuple):
         """Whether there is no attractor, so that staying is what is wanted."""
         return bool(self.problem.attractor.empty)
 
-    def images(self, slack: float = 0.0, whole: WholeCells | None = None) -> BoxImages:
+    def images(self, slack: float = 0.0, whole: CellRanges | None = None) -> BoxImages:
         """Return what encloses images of boxes."""
         return BoxImages(self.problem, self.partition, self.status, self.control, slack, whole)
 
-    def whole(self, deadline: Deadline) -> WholeCells | None:
+    def whole(self, deadline: Deadline) -> CellRanges | None:
         """Return what the compiled model knows of the images of whole cells."""
-        return WholeCells.of(self.problem, self.partition, self.status, self.control, deadline)
+        return CellRanges.of(self.problem, self.partition, self.status, self.control, deadline)
 
     def game(self, slack: float = 0.0) -> Game:
         """Return the choice of controls that every law has."""

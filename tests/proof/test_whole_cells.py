@@ -17,7 +17,7 @@ from lmdsl.proof import proving
 from lmdsl.proof.bounds.tightening import tighten
 from lmdsl.proof.checking import faults
 from lmdsl.proof.cover import Cover
-from lmdsl.proof.images.whole import WholeCells
+from lmdsl.proof.images.whole import CellRanges
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.prover import Prover
 from lmdsl.proof.record import Proof
@@ -92,7 +92,7 @@ def test_nothing_is_known_where_successors_are_sampled():
 
 def test_it_is_given_up_where_the_time_is_up():
     loop = loop_of(lm.solve(made(LINE)))
-    assert isinstance(loop.whole(Deadline()), WholeCells)
+    assert isinstance(loop.whole(Deadline()), CellRanges)
     assert loop.whole(Deadline(1e-9)) is None
 
 

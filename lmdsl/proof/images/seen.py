@@ -13,7 +13,7 @@ from lmdsl.model.successors.compiled import enclosing, places, tapes
 from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 from lmdsl.proof.images.pieces import DEEPEST, Integers, Pieces, pieces
-from lmdsl.proof.images.whole import WholeCells
+from lmdsl.proof.images.whole import CellRanges
 
 SOME = 2**13  # most boxes enclosed at a time by a thread
 KEPT = 2**22  # doubles of paths above which fewer boxes are enclosed at a time
@@ -64,7 +64,7 @@ class BoxImages:
 
     def __init__(
         self, problem: Problem, partition: Partition, status: Statuses, control: Floats,
-        slack: float = 0.0, whole: WholeCells | None = None,
+        slack: float = 0.0, whole: CellRanges | None = None,
     ) -> None:  # fmt: skip
         self.problem, self.partition, self.whole = problem, partition, whole
         self.control, self.slack = control, slack

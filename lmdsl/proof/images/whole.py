@@ -24,7 +24,7 @@ from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 
 
-class WholeCells(NamedTuple):
+class CellRanges(NamedTuple):
     """Ranges of the images of the cells of C under their controls.
 
     Attributes
