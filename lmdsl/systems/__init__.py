@@ -20,6 +20,7 @@ from lmdsl.systems.inverted_pendulum import InvertedPendulum as InvertedPendulum
 from lmdsl.systems.pendulum_on_cart import PendulumOnCart as PendulumOnCart
 from lmdsl.systems.van_der_pol import VanDerPol as VanDerPol
 from lmdsl.systems.lorenz import Lorenz as Lorenz
+from lmdsl.systems.cart_pole import CartPole as CartPole
 # isort: on
 
 # Every system known by name, by its ``kind``.

@@ -124,13 +124,16 @@ def test_other_words_are_refused(word):
         made(decay(-3.0, word))
 
 
-@pytest.mark.parametrize("name", ["inverted_pendulum", "pendulum_on_cart", "van_der_pol", "lorenz"])
+@pytest.mark.parametrize(
+    "name", ["inverted_pendulum", "pendulum_on_cart", "van_der_pol", "lorenz", "cart_pole"]
+)
 def test_what_init_writes_settles_below_a_hundredth(name):
     data = lm.systems.NAMED[name].problem
     assert data["system"]["substeps"] == "auto"
     problem = settled(made(data))
     assert problem.system.substeps == {
         "inverted_pendulum": 1, "pendulum_on_cart": 2, "van_der_pol": 4, "lorenz": 8,
+        "cart_pole": 2,
     }[name]  # fmt: skip
     found = integration_error(problem)
     assert found.halving < 0.01

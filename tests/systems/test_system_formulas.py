@@ -50,6 +50,17 @@ def pendulum_on_cart(s, u):
     return [omega, np.linalg.solve(mass, force)[1]]
 
 
+def cart_pole(s, u):
+    """The same equations, with the cart's place and with friction."""
+    m, M, length, g, b, d = 0.1, 1.0, 0.5, 9.8, 0.1, 2e-6
+    _, theta, v, omega = s
+    bent = m * length * np.cos(theta)
+    force = u - b * v + m * length * omega**2 * np.sin(theta)
+    torque = m * g * length * np.sin(theta) - d * omega
+    rates = np.linalg.solve([[M + m, bent], [bent, 4 / 3 * m * length**2]], [force, torque])
+    return [v, omega, *rates]
+
+
 def van_der_pol(s, u):
     return [s[1], u - s[0] + (1 - s[0]) * (1 + s[0]) * s[1]]
 
@@ -69,7 +80,9 @@ def integrate(field, x, u, duration):
     return np.array(flows).T
 
 
-@pytest.mark.parametrize("by_hand", [inverted_pendulum, pendulum_on_cart, van_der_pol, lorenz])
+@pytest.mark.parametrize(
+    "by_hand", [inverted_pendulum, pendulum_on_cart, van_der_pol, lorenz, cart_pole]
+)
 def test_sampled_flow_agrees_with_an_integrator(by_hand):
     """The right-hand side is right, and RK4's error is small against a cell."""
     problem = variant(by_hand.__name__)

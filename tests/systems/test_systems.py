@@ -21,6 +21,7 @@ EXPECTED = {
     "pendulum_on_cart": (4, 3248, 0.75),
     "van_der_pol": (4, 3196, 0.85),
     "lorenz": (8, 10188, 0.86),
+    "cart_pole": (32, 54914, 0.83),
 }
 
 

@@ -15,7 +15,14 @@ from benchmarks.zoo import page, pictures
 
 ZOO = zoo.entries()
 WELL_BELOW = 60_000  # bytes of a picture
-SLOW = {"cart_pole", "compressor", "lorenz", "reaction_wheel", "unicycle"}  # about two seconds
+SLOW = {
+    "cart_pole",
+    "cart_pole_swing_up",
+    "compressor",
+    "lorenz",
+    "reaction_wheel",
+    "unicycle",
+}  # about two seconds
 
 
 @functools.cache
