@@ -17,9 +17,9 @@ class CartPole(NamedOde):
 
     (M + m) x'' + m l (theta'' cos theta - theta'^2 sin theta) = u - b x' along the rail, and
     4/3 m l^2 theta'' + m l x'' cos theta = m g l sin theta - d theta' about the hinge. States x
-    (place of the cart, m), theta (angle from upright, rad, not wrapped), v = x' (m/s), omega = theta'
-    (rad/s); control u (force on the cart, N); M (cart, kg), m (pole, kg), l (half the pole's length,
-    m), g (m/s^2), b (friction of the cart, N s/m), d (friction of the hinge, N m s).
+    (place of the cart, m), theta (angle from upright, rad, not wrapped), v = x' (m/s),
+    omega = theta' (rad/s); control u (force on the cart, N); M (cart, kg), m (pole, kg), l (half
+    the pole's length, m), g (m/s^2), b (friction of the cart, N s/m), d (of the hinge, N m s).
     """
 
     kind: Literal["cart_pole"] = "cart_pole"
