@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with kept() as answers:
         try:
             with contextlib.redirect_stdout(answers):  # for --help
-                parsed = _parser().parse_args(arguments)
+                parsed = parser().parse_args(arguments)
         except SystemExit as stop:
             return int(stop.code or 0)
         return _run(parsed)
@@ -42,19 +42,24 @@ def _run(parsed: Arguments) -> int:
     try:
         with narrated():
             return int(parsed.run(parsed))
-    except KeyboardInterrupt:
+    except (Exception, KeyboardInterrupt) as error:
+        return failed(parsed, error)
+
+
+def failed(parsed: Arguments, error: BaseException) -> int:
+    """Say why a command failed, and return its exit status."""
+    if isinstance(error, KeyboardInterrupt):
         return _fail("interrupted", 130)
-    except MemoryError:
+    if isinstance(error, MemoryError):
         return _bad(parsed, "out of memory; use fewer cells, controls or sample points")
-    except TimeLimitReached as error:
+    if isinstance(error, TimeLimitReached):
         return _bad(parsed, str(error), Status.SOLVER_FAILED)
-    except LmdslError as error:
+    if isinstance(error, LmdslError):
         return _bad(parsed, str(error))
-    except Exception as error:
-        if os.environ.get("LMDSL_DEBUG"):
-            raise
-        what = f"internal error: {type(error).__name__}: {shown(str(error), 200)}"
-        return _fail(f"{what}; please report it (LMDSL_DEBUG=1 shows where)", 4)
+    if os.environ.get("LMDSL_DEBUG"):
+        raise error
+    what = f"internal error: {type(error).__name__}: {shown(str(error), 200)}"
+    return _fail(f"{what}; please report it (LMDSL_DEBUG=1 shows where)", 4)
 
 
 def _fail(message: str, status: int) -> int:
@@ -75,18 +80,19 @@ def _bad(parsed: Arguments, message: str, status: Status = Status.BAD_INPUT) -> 
     return _fail(message, status.exit_status)
 
 
-def _parser() -> argparse.ArgumentParser:
+def parser() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
     from lmdsl import __version__
 
-    parser = argparse.ArgumentParser(
+    found = argparse.ArgumentParser(
         prog="lmdsl",
         description="Optimal stabilization with Lyapunov measures, verified.",
         epilog="Exit status: 0 verified, 1 not verified, 2 bad input, 3 not stabilizable, "
         "4 a solver failed or hit its limit.",
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action="version", version=f"lmdsl {__version__}")
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    found.add_argument("--version", action="version", version=f"lmdsl {__version__}")
+    commands = found.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     def command(name: str, run: Run, text: str) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
@@ -95,4 +101,4 @@ def _parser() -> argparse.ArgumentParser:
 
     for group in (solving, results, feasibility, studies, listing):
         group.add(command)
-    return parser
+    return found

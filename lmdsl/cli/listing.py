@@ -133,10 +133,10 @@ def _completion(parsed: Arguments) -> int:
 def _completed(file: Any, shells: Sequence[str]) -> argparse.ArgumentParser:
     """Return the parser of the command line, with what may stand where a name or a file does."""
     from lmdsl import backends
-    from lmdsl.cli import _parser
+    from lmdsl.cli import parser as of_commands
     from lmdsl.systems import NAMED
 
-    parser = _parser()
+    parser = of_commands()
     choices = {"name": list(NAMED), "backend": backends.names(), "shell": shells}
     (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
     for command in commands.choices.values():

@@ -72,7 +72,8 @@ def _problem_options(sub: argparse.ArgumentParser) -> None:
                      help="seconds for compiling and solving")  # fmt: skip
 
 
-def _problem(parsed: Arguments) -> Any:
+def problem_asked(parsed: Arguments) -> Any:
+    """Return the problem that a command names, its gamma as asked for."""
     problem = problem_at(parsed.file)
     return problem if parsed.gamma is None else problem.replaced(gamma=parsed.gamma)
 
@@ -83,7 +84,7 @@ def _solve(parsed: Arguments) -> int:
 
         refuse_unless_free(parsed.out)
         parsed.place = Path(parsed.out).absolute()  # a solver may change the current directory
-    problem = _problem(parsed)
+    problem = problem_asked(parsed)
     from lmdsl.results.solving import solve
 
     with ProgressLine() as progress:
@@ -91,13 +92,13 @@ def _solve(parsed: Arguments) -> int:
         result = solve(problem, parsed.backend, progress=progress, **options)
     tell(result.log)
     if not parsed.json:  # reported first: whatever saving meets, the answer was given
-        say(_summary(result))
+        say(summary(result))
     status = int(result.exit_status)
     try:  # what is known by now is known whatever becomes of saving and simulation
         if parsed.out is not None and result.lp is not None:  # else no time to compile
             status = _saved(result, parsed)
         if parsed.simulate:
-            result = _simulated(result)
+            result = simulated(result)
     finally:
         if parsed.json:
             print_json(result.to_dict())
@@ -123,7 +124,7 @@ def _saved(result: Any, parsed: Arguments) -> int:
     return int(result.exit_status)
 
 
-def _simulated(result: Any) -> Any:
+def simulated(result: Any) -> Any:
     """Return a result with runs of the true map, where there is a controller."""
     if (result.control_index < 0).all():
         return result
@@ -138,7 +139,7 @@ def _simulated(result: Any) -> Any:
 
 
 def _compare(parsed: Arguments) -> int:
-    problem = _problem(parsed)
+    problem = problem_asked(parsed)
     from lmdsl.results.comparison import compare
 
     names = [name.strip() for name in parsed.backends.split(",") if name.strip()]
@@ -153,7 +154,9 @@ def _compare(parsed: Arguments) -> int:
     return comparison.exit_status
 
 
-def _summary(result: Any) -> str:
+def summary(result: Any) -> str:
+    """Return what a result says to people, whether of one process or of all ranks."""
+
     def number(value: float | None, digits: str = ".9g") -> str:
         return "not established" if value is None else format(value, digits)
 
@@ -171,7 +174,7 @@ def _summary(result: Any) -> str:
     ]  # fmt: skip
     if result.problem.discount is not None:
         rows.append(("discount", _discount(result)))
-    if result.lp is None:  # there was no time to compile
+    if result.pairs is None:  # there was no time to compile
         rows[3:6] = [("cells", str(result.cells)), ("controls", str(result.controls))]
     elif result.status != Status.NOT_STABILIZABLE:
         rows += [
@@ -261,9 +264,6 @@ def _others(result: Any) -> str:
         CellStatus.AVOID: "avoid",
         CellStatus.BEYOND_GAMMA: "beyond gamma",
     }
-    parts = [
-        f"{count} {text}"
-        for code, text in named.items()
-        if (count := int((result.cell_status == code).sum()))
-    ]
+    counted = result.counted
+    parts = [f"{counted[code]} {text}" for code, text in named.items() if counted[code]]
     return " + ".join(parts) or "0 others"

@@ -59,6 +59,17 @@ def say(text: str) -> None:
     print(_escaped(text), file=_answers.get() or sys.stdout)
 
 
+@contextlib.contextmanager
+def muted() -> Iterator[None]:
+    """Lose answers."""
+    with open(os.devnull, "w") as nowhere:
+        token = _answers.set(Stream(nowhere))
+        try:
+            yield
+        finally:
+            _answers.reset(token)
+
+
 def tell(log: str) -> None:
     """Print what a solver printed on stderr."""
     if log:

@@ -48,12 +48,17 @@ def write_new(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
     """Write a file that must not exist yet, and wait until it is on the disk."""
     with open(path, "xb") as file:
         file.writelines(pieces)
-        file.flush()
-        try:
-            os.fsync(file.fileno())
-        except OSError as error:
-            if error.errno not in _NO_SYNC:
-                raise
+        synced(file)
+
+
+def synced(file: BinaryIO) -> None:
+    """Wait until what was written is on the disk, where the file system knows that."""
+    file.flush()
+    try:
+        os.fsync(file.fileno())
+    except OSError as error:
+        if error.errno not in _NO_SYNC:
+            raise
 
 
 # What fsync says on file systems that do not know it; other errors mean lost data.

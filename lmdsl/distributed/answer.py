@@ -1,18 +1,20 @@
 """What a solve over ranks returns on every rank."""
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.certificate.claims import Certificate
 from lmdsl.common.types import Floats, Indices, Statuses
+from lmdsl.control.simulation import Simulation
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
+from lmdsl.results.result import missed_rewards
 from lmdsl.results.status import Cause
 from lmdsl.results.summary import Coverage, Summary
 
@@ -42,7 +44,9 @@ class Answer(Summary):
         As of a Result, of own cells.
     dropped
         Pairs (cell, control) left out, (D, 2), of all cells; or None.
-    model_sha256
+    ended_by_discount
+        As of a Result.
+    model_sha256, digest
         Version 2 of the digest of the model: the same for every number of ranks.
     lp
         The model of own cells, as :func:`lmdsl.slabs.compiling.compiled` returns it.
@@ -66,13 +70,23 @@ class Answer(Summary):
     witness: Floats
     sure_levels: NDArray[np.int32] | None = None
     dropped: NDArray[np.int64] | None = None
+    ended_by_discount: float | None = None
     model_sha256: str = ""
+    digest: int = 2
+    gap_before_polish: None = None
+    proof: None = None
     lp: StabilizationLP | None = field(default=None, compare=False)
 
     @property
     def verified(self) -> bool:
         """True when the certificate is complete and the gap within the tolerance."""
         return self.certificate.verified
+
+    @property
+    def reward(self) -> float | None:
+        """The mean reward by m that the policy earns at least; None where costs are minimised."""
+        missed = missed_rewards(self.problem)
+        return None if missed is None or self.cost is None else missed - self.cost
 
     @property
     def coverage(self) -> Coverage | None:
@@ -92,6 +106,10 @@ class Answer(Summary):
     def beyond_gamma(self) -> Area | None:
         """The cells proved infeasible at this gamma, by region; None where none is."""
         return self.area
+
+    def with_runs(self, simulation: Simulation | None) -> Self:
+        """Return the same with runs of the true map."""
+        return replace(self, simulation=simulation)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of own cells by name, as a result directory names them."""

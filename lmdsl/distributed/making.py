@@ -1,5 +1,6 @@
 """Answers made of what ranks found: arrays of own cells, facts that all share."""
 
+import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
@@ -35,7 +36,14 @@ from lmdsl.systems import DataSystem
 
 BACKEND = "policy-iteration"
 ARRAYS = ("control_index", "value", "lower", "measure", "cell_status", "witness", "sure_levels")
-FACTS = ("problem", "certificate", "cause", "iterations", "dropped")  # beside those of a summary
+FACTS = (
+    "problem",
+    "certificate",
+    "cause",
+    "iterations",
+    "dropped",
+    "ended_by_discount",
+)  # beside those of a summary
 
 
 class AnswerMaker:
@@ -163,8 +171,16 @@ class AnswerMaker:
             lower=self._over(witness.W if proof.lower_bound else None, 0.0, 0.0, np.inf),
             measure=self._over(witness.mu, 0.0, 0.0, 0.0), cell_status=lp.cell_status,
             witness=self._over(w, 0.0, 0.0, 0.0), sure_levels=lp.sure_levels, dropped=lp.dropped,
-            sure=self._sure(), model_sha256=digest.of_model(self.ranks, lp), lp=lp, **more,
+            sure=self._sure(), ended_by_discount=self._ended(witness, proof),
+            model_sha256=digest.of_model(self.ranks, lp), lp=lp, **more,
         )  # fmt: skip
+
+    def _ended(self, witness: Witness, proof: Certificate) -> float | None:
+        """Return the share of runs that the discount ends, as a result says it."""
+        b = self.problem.discount
+        if b is None or self.lp.gamma != 1 or not proof.measure or witness.mu is None:
+            return None
+        return min(1.0, (1 - b) * math.fsum(self.ranks.collect(math.fsum(witness.mu))))
 
     def _sure(self) -> int | None:
         levels = self.lp.sure_levels

@@ -180,10 +180,12 @@ class Ranks(ABC):
         every = self.collect(item)
         odd = [k for k, other in enumerate(every) if other != every[0]]
         if odd:
-            raise RankError(
+            error = RankError(
                 f"ranks see different {what}: rank {odd[0]} has {every[odd[0]]!r}, rank 0 "
                 f"{every[0]!r}; start all of them from the same folder, file and installation"
             )
+            vars(error)["agreed"] = True  # each has found the same
+            raise error
 
     @abstractmethod
     def trouble(self) -> bool:

@@ -116,7 +116,7 @@ class Result(Paged, Carried, Summary, InUse):
     @property
     def reward(self) -> float | None:
         """The mean reward by m that the policy earns at least; None where costs are minimised."""
-        missed = self._missed
+        missed = missed_rewards(self.problem)
         return None if missed is None or self.cost is None else missed - self.cost
 
     @property
@@ -125,18 +125,11 @@ class Result(Paged, Carried, Summary, InUse):
 
         None where costs are minimised.
         """
-        missed = self._missed
+        missed = missed_rewards(self.problem)
         if missed is None:
             return None
         attractor = self.cell_status == CellStatus.ATTRACTOR
         return np.where(attractor, 0.0, missed - self.value)
-
-    @property
-    def _missed(self) -> float | None:
-        system = self.problem.system
-        if not isinstance(system, MatrixSystem) or system.best_reward is None:
-            return None
-        return system.missed(self.problem.gamma, self.problem.discount)
 
     @property
     def ended_by_discount(self) -> float | None:
@@ -144,10 +137,15 @@ class Result(Paged, Carried, Summary, InUse):
 
         It is (1 - b) sum(mu): mu counts visits, each the last one with probability 1 - b.
         """
-        b = self.problem.discount
-        if b is None or self.gamma != 1 or not self.certificate.measure:
+        if self.problem.discount is None or self.gamma != 1 or not self.certificate.measure:
             return None
-        return min(1.0, (1 - b) * math.fsum(self.measure))
+        return min(1.0, (1 - self.problem.discount) * math.fsum(self.measure))
+
+    @property
+    def counted(self) -> tuple[int, ...]:
+        """Number of cells by :class:`CellStatus`; of a result without a model nothing is known."""
+        found = np.bincount(self.cell_status, minlength=len(CellStatus))
+        return tuple(found[: len(CellStatus)].tolist())
 
     @property
     def stability_vector(self) -> Floats:
@@ -258,3 +256,11 @@ class Result(Paged, Carried, Summary, InUse):
             parts.append(f"gap={self.gap:.2g}")
         parts.append(str(self.coverage or f"{self.cells} cells"))
         return f"Result({', '.join(parts)})"
+
+
+def missed_rewards(problem: Problem) -> float | None:
+    """Return what rewards lack of the costs that stand for them; None where costs are minimised."""
+    system = problem.system
+    if not isinstance(system, MatrixSystem) or system.best_reward is None:
+        return None
+    return system.missed(problem.gamma, problem.discount)

@@ -119,7 +119,7 @@ def check_command(command: str, output: str, status: int, where: str) -> None:
     if words[0] != "lmdsl":
         return
     if not output and not status:
-        cli._parser().parse_args(words[1:])
+        cli.parser().parse_args(words[1:])
         return
     found, got = run(words[1:])
     assert found == status, f"{where}: `{command}` gave {found}"

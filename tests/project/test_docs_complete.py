@@ -37,7 +37,7 @@ def section(text: str, heading: str) -> str:
 
 
 def subcommands():
-    parser = cli._parser()
+    parser = cli.parser()
     (choices,) = [a.choices for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
     return choices
 

@@ -81,7 +81,7 @@ def test_every_column_and_line_of_other_reports_is_explained():
 
 
 def test_every_option_says_what_it_does():
-    parser = cli._parser()
+    parser = cli.parser()
     (commands,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
     for name, command in commands.choices.items():
         for action in command._actions:

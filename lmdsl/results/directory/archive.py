@@ -50,9 +50,9 @@ def save(result: Result, path: str | os.PathLike[str]) -> None:
         raise BadInput("there is no model to save: " + result.message, "out")
     writing.refuse_unless_free(path)
     contents = _contents(result)
-    about = _certificate(result)
+    told = about(result)
     try:
-        writing.write(writing.place(path), contents, lambda keys: reading.text({**about, **keys}))
+        writing.write(writing.place(path), contents, lambda keys: reading.text({**told, **keys}))
     except OSError as error:
         text = shown(str(path), 200)
         raise BadInput(f"cannot write {text}: {reason(error)}", "out") from None
@@ -75,7 +75,7 @@ def rescue(result: Result, path: str | os.PathLike[str]) -> Path | None:
 
 def _contents(result: Result) -> dict[str, bytes]:
     """Return the files of a result but its certificate."""
-    contents = _declared(result)
+    contents = declared_files(result)
     contents[vectors.ARCHIVE] = arrays.packed(
         {name: getattr(result, name) for name in types(result.problem)}
     )
@@ -84,7 +84,7 @@ def _contents(result: Result) -> dict[str, bytes]:
     return contents | repaired.contents(result)
 
 
-def _declared(result: Result) -> dict[str, bytes]:
+def declared_files(result: Any) -> dict[str, bytes]:
     """Return the files that say what was solved."""
     problem, contents = result.problem, {}
     if problem.functions:
@@ -106,16 +106,19 @@ def _declared(result: Result) -> dict[str, bytes]:
     return contents
 
 
-def _certificate(result: Result) -> dict[str, Any]:
-    proof = result.certificate
+def about(result: Any) -> dict[str, Any]:
+    """Return what certificate.json says of a result, but for the files beside it."""
+    proof, known = result.certificate, (result.model_sha256, result.digest)
+    if result.lp is not None and result.digest == 1:
+        known = identity(result.lp), 1
     apart = {
         "format": FORMAT,
         "beyond_gamma": result.beyond_gamma,
         "claims": proof.claims,
         "measure_residual": proof.measure_residual,
         "reasons": proof.reasons,
-        "model_sha256": result.model_sha256 if result.lp is None else identity(result.lp),
-        "digest": result.digest if result.lp is None else 1,
+        "model_sha256": known[0],
+        "digest": known[1],
         "versions": versions(),
         "scope": scope(result.problem),
         "proof": proved.said_of(result.proof),
