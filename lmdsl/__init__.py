@@ -12,6 +12,7 @@ from lmdsl.machine import forking as forking
 
 if TYPE_CHECKING:
     from lmdsl import backends as backends
+    from lmdsl import distributed as distributed
     from lmdsl import interop as interop
     from lmdsl import plotting as plotting
     from lmdsl import systems as systems
@@ -90,7 +91,8 @@ _HOME = {
     "suggest": "advice.suggesting.search",
     "verify": "results.verification",
 }
-_PACKAGES = {name: name for name in ("backends", "interop", "plotting", "systems", "testing")}
+_OPEN = ("backends", "distributed", "interop", "plotting", "systems", "testing")
+_PACKAGES = {name: name for name in _OPEN}
 _PACKAGES["exports"] = "results.exports"
 
 __all__ = ["__version__", *_HOME, *_PACKAGES]

@@ -137,6 +137,7 @@ def _require_supported(parsed: Arguments) -> None:
         "--backend": parsed.backend != "policy-iteration",
         "--max-iterations": parsed.max_iterations is not None,
         "--proved": parsed.proved is not None,
+        "--rows-on-disk": parsed.rows_on_disk is not None,
     }
     for name, asked in given.items():
         if asked:

@@ -28,11 +28,20 @@ _inside = threading.local()
 
 def count() -> int:
     """Return the number of threads to use: the processors at hand, or fewer if so asked."""
+    return max(1, min(len(processors()), int(kernels.threads)))
+
+
+def processors() -> tuple[int, ...]:
+    """Return the numbers of the processors at hand."""
     try:
-        processors = len(os.sched_getaffinity(0))
+        return tuple(sorted(os.sched_getaffinity(0)))
     except AttributeError:  # not on this operating system
-        processors = os.cpu_count() or 1
-    return max(1, min(processors, int(kernels.threads)))
+        return tuple(range(os.cpu_count() or 1))
+
+
+def limit(most: int) -> None:
+    """Use no more threads from here on; at least one."""
+    kernels.threads = max(1, min(most, int(kernels.threads)))
 
 
 def ranges(total: int, count: int) -> list[tuple[int, int]]:

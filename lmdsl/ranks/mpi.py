@@ -5,6 +5,7 @@ lie in memory; what is small and of any kind is pickled: it comes from the same 
 """
 
 import pickle
+import socket
 import sys
 import time
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.errors import MissingDependency
+from lmdsl.machine import threads
 from lmdsl.ranks.launchers import launched
 from lmdsl.ranks.verbs import Alone, Item, RankError, Ranks, require_expected
 
@@ -180,4 +182,13 @@ def at_hand() -> Ranks:
             "launcher are of different MPIs; use the mpiexec that belongs to mpi4py's (of Slurm, "
             "srun --mpi=pmi2 or pmix)"
         )
+    _share_processors(found)
     return found
+
+
+def _share_processors(ranks: MpiRanks) -> None:
+    """Let ranks that may use the same processors use each a share of them."""
+    processors = threads.processors()
+    here = socket.gethostname(), processors
+    sharing = ranks.world.allgather(here).count(here)
+    threads.limit(len(processors) // sharing)

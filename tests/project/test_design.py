@@ -36,9 +36,9 @@ PUBLIC = [
     "Area", "BadInput", "CellStatus", "Certificate", "CheckReport", "Comparison", "Controller",
     "Explanation", "Finding", "GammaBar", "LmdslError", "PhaseOne", "Problem", "Region", "Result",
     "Simulation", "StabilizationLP", "Study", "Suggestion", "TimeLimitReached", "Verification",
-    "__version__", "backends", "check", "compare", "compile", "explain", "exports", "from_data",
-    "from_matrices", "gamma_max", "interop", "load", "plotting", "read_data", "solve", "study",
-    "suggest", "systems", "testing", "verify",
+    "__version__", "backends", "check", "compare", "compile", "distributed", "explain", "exports",
+    "from_data", "from_matrices", "gamma_max", "interop", "load", "plotting", "read_data", "solve",
+    "study", "suggest", "systems", "testing", "verify",
 ]  # fmt: skip
 
 
