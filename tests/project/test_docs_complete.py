@@ -89,7 +89,7 @@ def test_outputs_are_described():
     result = lm.solve(lm.load(ROOT / "examples/logistic_map.json"))
     assert not missing([*result.to_dict(), *Status], section(text, "## `lmdsl solve`"))
     directory = section(text, "## The result directory")
-    stored = archive._certificate(result)
+    stored = archive.about(result)
     assert not missing(set(stored) - set(result.to_dict()), directory)
     arrays = {*archive.TYPES, *archive._model_arrays(result.lp)}
     assert not missing({*stored["claims"], *arrays}, directory)
