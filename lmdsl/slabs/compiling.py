@@ -6,12 +6,14 @@ What must hold: the LPs of all ranks, one after the other and in global numbers,
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from lmdsl.common.on_disk import Disk, beside, taken
 from lmdsl.common.types import Floats, Indices, Statuses
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.substeps import settled
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.partition import Partition
@@ -27,23 +29,26 @@ from lmdsl.slabs.graph.pairs import OwnPairs, assembled
 
 
 def compiled(
-    ranks: Ranks, problem: Problem, deadline: Deadline | None = None, disk: Disk | None = None
-) -> StabilizationLP:
-    """Return the LP of the own cells of C; collective.
+    ranks: Ranks, problem: Problem, deadline: Deadline | None = None, disk: Disk | None = None,
+    dropped: Any = None,
+) -> StabilizationLP:  # fmt: skip
+    """Return the LP of the own cells of C; collective. ``dropped`` as of :func:`lmdsl.compile`.
 
-    Its ``cell_status`` is that of the own part of the box: from the first own free cell to that of
-    the next rank.
+    Its ``cell_status``, ``sure_levels`` and ``hold`` are those of the own part of the box: from the
+    first own free cell to that of the next rank.
     """
     deadline = Deadline.of(deadline)
     problem = ranks.agreed(lambda: settled(problem, deadline))
     partition = ranks.agreed(lambda: Partition.of(problem))
-    pairs = assembled(ranks, problem, partition, deadline, disk)
+    pairs = assembled(ranks, problem, partition, deadline, disk, dropped)
     rows = pairs.rows if problem.ends_in_time else pairs.rows.without_end()
-    found = levels.stabilizable(pairs.mesh, pairs.pair_pointer, rows, deadline)
+    found = levels.stabilizable(pairs.mesh, pairs.pair_pointer, rows, deadline,
+                                pairs.successors, pairs.left)  # fmt: skip
     inside = found.inside[: pairs.mesh.own]
     mesh, kept, own = _restricted(pairs, found)
     first, last = pairs.mesh.division.own(ranks.rank)
     cells = pairs.sets.free[first:last][inside]
+    part = _part(pairs)
     level, pair = found.level[inside], found.pair[inside]
     per_cell = np.diff(np.append(0, np.cumsum(found.surviving))[pairs.pair_pointer])[inside]
     return StabilizationLP(
@@ -58,6 +63,9 @@ def compiled(
         cost=taken(pairs.cost, kept),
         gamma=problem.gamma,
         weight=_weight(ranks, pairs.sets, cells),
+        sure_levels=None if pairs.successors is None else pairs.successors.sure_levels(*part),
+        hold=None if pairs.hold is None else pairs.hold[slice(*part)].copy(),
+        dropped=pairs.dropped,
         mesh=mesh,
         _known=(level, pair if isinstance(kept, slice) else np.searchsorted(kept, pair)),
     )
@@ -96,15 +104,30 @@ def _statuses(pairs: OwnPairs, found: Stabilizable) -> Statuses:
     """Return the status code of every cell of the own part of the box, as of one process."""
     code = np.full(len(found.level), CellStatus.LEADS_TO_THESE, dtype=np.uint8)
     code[~found.reaches] = CellStatus.TRAPPED
-    code[np.diff(pairs.pair_pointer) == 0] = CellStatus.ESCAPES
+    if not pairs.empty:
+        code[_choices(pairs, found) == 0] = CellStatus.ESCAPES
     code[found.inside[: len(code)]] = CellStatus.STABILIZED
-    sets, rank, starts = pairs.sets, pairs.mesh.ranks.rank, pairs.mesh.division.starts
-    begins = np.append(sets.free, len(sets.number))  # of the free cells, and the end of the box
-    first, last = int(begins[starts[rank]]) if rank else 0, int(begins[starts[rank + 1]])
+    sets, (first, last) = pairs.sets, _part(pairs)
     status = np.full(last - first, CellStatus.AVOID, dtype=np.uint8)
     status[sets.attractor[first:last]] = CellStatus.ATTRACTOR
-    status[sets.free[starts[rank] : starts[rank + 1]] - first] = code
+    a, b = pairs.mesh.division.own(pairs.mesh.ranks.rank)
+    status[sets.free[a:b] - first] = code
     return status
+
+
+def _choices(pairs: OwnPairs, found: Stabilizable) -> Indices:
+    """Return how many pairs may be used in every own cell."""
+    if found.admissible is None:
+        return np.diff(pairs.pair_pointer)
+    cells = owner(pairs.pair_pointer)[found.admissible]
+    return np.bincount(cells, minlength=len(pairs.pair_pointer) - 1)
+
+
+def _part(pairs: OwnPairs) -> tuple[int, int]:
+    """Return the first cell of the own part of the box, and the one after its last."""
+    sets, rank, starts = pairs.sets, pairs.mesh.ranks.rank, pairs.mesh.division.starts
+    begins = np.append(sets.free, len(sets.number))  # of the free cells, and the end of the box
+    return int(begins[starts[rank]]) if rank else 0, int(begins[starts[rank + 1]])
 
 
 def _weight(ranks: Ranks, sets: CellSets, cells: Indices) -> Floats:

@@ -69,6 +69,10 @@ def of_model(ranks: Ranks, lp: StabilizationLP) -> str:
     counts = ranks.collect(len(lp.cell_status))
     box = Division(np.append(0, np.cumsum(counts)), np.arange(len(counts) + 1))
     header += digest(ranks, box, b"", [ByCell(lp.cell_status, "<u1")]).encode()
+    if lp.hold is not None:
+        header += digest(ranks, box, b"hold", [ByCell(lp.hold, "<i4")]).encode()
+    if lp.dropped is not None:
+        header += b"dropped" + np.ascontiguousarray(lp.dropped, dtype="<i8").tobytes()
     entries = rows.pointer[lp.pair_pointer]
     return digest(ranks, division, header, (
         ByCell(lp.cells, "<i8"),

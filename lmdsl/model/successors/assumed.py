@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lmdsl.common.types import Bools, Floats, Guard
+from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.errors import BadInput
 from lmdsl.formulas import intervals as iv
 from lmdsl.formulas.intervals import Interval
@@ -69,11 +69,13 @@ def encloser_of(true_map: TrueMap) -> Encloser:
 
 
 def require_samples_within(
-    transitions: Transitions, partition: Partition, ranges: tuple[Any, Any], admissible: Bools
-) -> None:
+    transitions: Transitions, partition: Partition, ranges: tuple[Any, Any], admissible: Bools,
+    cells: Indices,
+) -> None:  # fmt: skip
     """Refuse constants that a sample contradicts: it ends in no cell of its pair's ranges.
 
-    ``ranges`` are first and last indices, shape (pairs, parts, d). So rows lie within them.
+    ``ranges`` are first and last indices, shape (pairs, parts, d), of the pairs of ``cells``. So
+    rows lie within them.
     """
     rows, free = transitions.rows, transitions.sets.free
     pair = np.repeat(np.arange(rows.count), np.diff(rows.pointer))
@@ -89,7 +91,7 @@ def require_samples_within(
         within |= each
     if not within.all():
         at = int(pair[np.argmin(within)])
-        own = int(free[owner(transitions.pair_pointer)[at]])
+        own = int(cells[owner(transitions.pair_pointer)[at]])
         raise BadInput(
             f"a sample of cell {own} under control {int(transitions.control[at])} ends further "
             "from the image of the cell's middle than the constants allow; make them larger, or "

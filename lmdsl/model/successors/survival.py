@@ -56,34 +56,36 @@ class Successors:
         deadline: Deadline,
         progress: Progress | None = None,
         way: CellSets | None = None,
+        cells: Indices | None = None,
     ) -> Self | None:
         """Enclose the images of all pairs of some transitions; None where samples suffice.
 
-        ``way`` are the sets that judge the way of steps, where these are others than judge its end.
+        ``way`` are the sets that judge the way of steps, where these are others than judge its end;
+        ``cells`` those whose pairs they are, where they are not those of all free cells.
         """
         if problem.successors != "enclosed":
             return None
         pointer, sets = transitions.pair_pointer, transitions.sets
-        cell = sets.free[owner(pointer)]
-        pairs = cell, transitions.control
+        cells = sets.free if cells is None else cells
+        pairs = cells[owner(pointer)], transitions.control
         found = enclosed(problem, partition, way or sets, pairs, deadline, progress)
         first, last = found.first, found.last
-        memory.require(2.0 * first.itemsize * len(sets.free) * partition.dimension, DOING)
-        shape = (len(sets.free), 1, partition.dimension)
+        memory.require(2.0 * first.itemsize * len(cells) * partition.dimension, DOING)
+        shape = (len(cells), 1, partition.dimension)
         least, most = (np.zeros(shape, dtype=first.dtype) for _ in range(2))
         hulls(fixed(pointer), fixed(first), fixed(last), least, most)
         ranges, reach = (fixed(first), fixed(last)), (fixed(least), fixed(most))
         admissible = ~found.out
         if "system" in problem.functions:
-            require_samples_within(transitions, partition, (first, last), admissible)
+            require_samples_within(transitions, partition, (first, last), admissible, cells)
         if way is not None:
             keep(table(sets.avoid, partition), *ranges, admissible)
         return cls(transitions, partition, admissible, ranges, reach, deadline)
 
     def choices(self, alive: Bools) -> Indices:
-        """Return how many pairs of every free cell are alive, shape (F,)."""
-        own = owner(self.transitions.pair_pointer)
-        return np.bincount(own[alive], minlength=len(self.transitions.sets.free)).astype(np.int64)
+        """Return how many pairs of every cell are alive, shape (F,)."""
+        pointer = self.transitions.pair_pointer
+        return np.bincount(owner(pointer)[alive], minlength=len(pointer) - 1).astype(np.int64)
 
     def remove(self, lost: Bools, alive: Bools, inside: Bools) -> None:
         """Remove free cells, the pairs that can meet them, and cells left without a pair."""

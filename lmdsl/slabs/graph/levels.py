@@ -18,6 +18,7 @@ from lmdsl.model.algorithm_1 import PATIENCE, Graph, Predecessors, _sweep, owner
 from lmdsl.model.rows import Rows
 from lmdsl.model.stabilizable_set import Stabilizable, _remove
 from lmdsl.ranks.mesh import Mesh
+from lmdsl.slabs.graph.meeting import OwnSuccessors
 
 
 class OwnRows:
@@ -69,8 +70,9 @@ def tree(mesh: Mesh, known: OwnRows, alive: Bools) -> tuple[NDArray[np.int32], I
 
 
 def stabilizable(
-    mesh: Mesh, pair_pointer: Indices, rows: Rows, deadline: Deadline | None = None
-) -> Stabilizable:
+    mesh: Mesh, pair_pointer: Indices, rows: Rows, deadline: Deadline | None = None,
+    successors: OwnSuccessors | None = None, left: Bools | None = None,
+) -> Stabilizable:  # fmt: skip
     """Return what :func:`lmdsl.model.stabilizable_set.stabilizable` does, of own cells and pairs.
 
     ``inside`` is of own cells and ghosts; the rest of own cells.
@@ -80,9 +82,12 @@ def stabilizable(
     known = OwnRows(pair_pointer, rows)
     # Ghosts have no pairs here.
     pairs = np.append(pair_pointer, np.full(mesh.columns - own, pair_pointer[-1]))
-    alive = np.ones(rows.count, dtype=np.bool_)
+    admissible = _both(None if successors is None else successors.own.admissible, left)
+    alive = np.ones(rows.count, dtype=np.bool_) if admissible is None else admissible.copy()
     inside = np.ones(mesh.columns, dtype=np.bool_)
     choices = np.diff(pair_pointer)
+    if left is not None:
+        choices = np.bincount(owner(pair_pointer)[left], minlength=own)
     reaches = None
     while True:
         level, pair = tree(mesh, known, alive)
@@ -90,8 +95,13 @@ def stabilizable(
         reaches = reached if reaches is None else reaches
         lost = np.flatnonzero(inside[:own] & ~reached)
         if not ranks.any(len(lost) > 0):
-            return Stabilizable(inside, alive, reaches, level, pair, None)
+            return Stabilizable(inside, alive, reaches, level, pair, admissible)
         ranks.agreed(lambda: deadline.raise_if_over("looking for the stabilizable set"))
+        if successors is not None:
+            kept = inside[:own].copy()
+            successors.remove(kept & ~reached, alive, kept)
+            inside = mesh.spread(kept, True)[:-1]
+            continue
         while True:
             before = known.before
             _remove(lost, before.pointer, before.pair, known.cell, pairs, alive, inside, choices)
@@ -99,6 +109,13 @@ def stabilizable(
             lost = np.flatnonzero(inside & ~told)
             if not ranks.any(len(lost) > 0):
                 break
+
+
+def _both(some: Bools | None, others: Bools | None) -> Bools | None:
+    """Return which pairs may be used by both; None: all may."""
+    if some is None or others is None:
+        return others if some is None else some
+    return some & others
 
 
 @kernel

@@ -5,25 +5,32 @@ whatever their number; targets in local numbers stand for the same cells, in the
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.on_disk import Disk
-from lmdsl.common.types import Floats, Indices
-from lmdsl.errors import BadInput
+from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.assembly.estimates import unless_short
+from lmdsl.model.assembly.given import cut
 from lmdsl.model.assembly.sampler import Block, Sampler
 from lmdsl.model.assembly.transitions import assemble
+from lmdsl.model.discretization import control_count
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.local import holding
 from lmdsl.model.local.controller import LocalController
 from lmdsl.model.rows import Rows
 from lmdsl.model.sets import CellSets
+from lmdsl.model.successors.left_out.dropping import listed, others
+from lmdsl.model.successors.survival import Successors
 from lmdsl.problem import Problem
 from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.verbs import Ranks
 from lmdsl.ranks.watching import Watched
+from lmdsl.slabs.graph.meeting import Marks, OwnSuccessors
 from lmdsl.systems import MatrixSystem
 
 LOOKED_AT = 64  # cells of which the admissible pairs are counted, to share pairs equally
@@ -45,6 +52,15 @@ class OwnPairs:
         Control index and stage cost of each pair.
     rows
         One row per pair, in local numbers.
+    empty
+        Whether no attractor cell holds, so that there is no pair and A is empty.
+    hold
+        Control of the attractor cells that hold, else -1, shape (N,); None if not asked for.
+    successors
+        What own pairs can meet; None where successors are not enclosed.
+    dropped, left
+        Pairs (cell, control) of all cells that are left out, (D, 2), and which own pairs are not
+        among them; None where all are.
     """
 
     sets: CellSets
@@ -53,46 +69,71 @@ class OwnPairs:
     control: NDArray[np.int32]
     cost: Floats
     rows: Rows
-
-
-def require_supported(problem: Problem) -> None:
-    """Refuse what does not run over ranks."""
-    local = problem.local_controller
-    faults = (
-        (problem.successors == "enclosed", "successors", '"enclosed" successors'),
-        (local is not None and local.kind == "hold", "local_controller", 'the kind "hold"'),
-    )
-    for asked, where, what in faults:
-        if asked:
-            raise BadInput(f"{what} does not run over several ranks; start one process", where)
+    empty: bool
+    hold: holding.Controls | None
+    successors: OwnSuccessors | None
+    dropped: NDArray[np.int64] | None
+    left: Bools | None
 
 
 def assembled(
-    ranks: Ranks,
-    problem: Problem,
-    partition: Partition,
-    deadline: Deadline | None = None,
-    disk: Disk | None = None,
-) -> OwnPairs:
+    ranks: Ranks, problem: Problem, partition: Partition, deadline: Deadline | None = None,
+    disk: Disk | None = None, dropped: Any = None,
+) -> OwnPairs:  # fmt: skip
     """Return the own pairs of this rank; collective. Raises what :func:`assemble` does."""
     from lmdsl import __version__
 
     deadline = Watched(ranks, Deadline.of(deadline))
-    ranks.agreed(lambda: require_supported(problem))
     ranks.alike((__version__, np.__version__), "versions of lmdsl and NumPy")
     ranks.alike(problem.model_dump_json(), "problems")
-    sets = ranks.agreed(lambda: CellSets.of(problem, partition, deadline))
-    if problem.local_controller is not None:  # refuse a wrong one before the work
-        ranks.agreed(lambda: LocalController.of(problem, partition, sets.attractor, deadline))
+    sets, hold, empty = ranks.agreed(lambda: _sets(problem, partition, deadline))
     division = ranks.agreed(lambda: divided(problem, partition, sets, ranks.count, deadline))
     span = division.own(ranks.rank)
+    cells = sets.free[slice(*span)]
     own = ranks.agreed(
-        lambda: assemble(problem, partition, deadline=deadline, sets=sets, span=span, disk=disk)
+        lambda: (
+            cut(holding.no_pairs(problem, partition, None, deadline, sets), span)
+            if empty
+            else assemble(problem, partition, deadline=deadline, sets=sets, span=span, disk=disk)
+        )
     )
+    met = ranks.agreed(lambda: Successors.asked_for(problem, partition, own, deadline, cells=cells))
+    pairs = ranks.agreed(lambda: listed(dropped, len(sets.number), control_count(problem)))
+    left = None if pairs is None else ranks.agreed(
+        lambda: others(_of_rank(pairs, sets, span, ranks.rank == 0), own, control_count(problem), cells)
+    )  # fmt: skip
     mesh = Mesh.of(ranks, division, own.rows.target)
     given = isinstance(problem.system, MatrixSystem)
     rows = replace(own.rows, target=_localised(mesh, own.rows, given), columns=mesh.columns)
-    return OwnPairs(sets, mesh, own.pair_pointer, own.control, own.cost, rows)
+    successors = None if met is None else OwnSuccessors(sets, Marks(ranks, division), met)
+    return OwnPairs(sets, mesh, own.pair_pointer, own.control, own.cost, rows, empty, hold,
+                    successors, pairs, left)  # fmt: skip
+
+
+def _sets(
+    problem: Problem, partition: Partition, deadline: Deadline
+) -> tuple[CellSets, holding.Controls | None, bool]:
+    """Return the sets that are compiled, the controls of cells that hold, and if none does.
+
+    Every rank makes them: they are small beside the rows.
+    """
+    limit = unless_short(problem, deadline)
+    declared = CellSets.of(problem, partition, limit)
+    if problem.local_controller is not None:  # refuse a wrong one before the work
+        LocalController.of(problem, partition, declared.attractor, limit)
+    hold = holding.held(problem, partition, declared, limit)
+    sets = holding.within(declared, problem, hold)
+    return sets, hold, holding.leaves_nothing(problem, hold)
+
+
+def _of_rank(
+    pairs: Indices, sets: CellSets, span: tuple[int, int], first: bool
+) -> Indices:  # fmt: skip
+    """Return the pairs of own free cells; the first rank's are also those of no free cell."""
+    number = sets.number[pairs[:, 0]]
+    strange = (number < 0) | (number >= len(sets.free))
+    own = (number >= span[0]) & (number < span[1]) & ~strange
+    return pairs[own | (strange & first)]
 
 
 def _localised(mesh: Mesh, rows: Rows, given: bool) -> NDArray[np.int32]:

@@ -23,11 +23,13 @@ def left_out(
 
     BadInput: they are no pairs of the transitions.
     """
-    pairs = _listed(dropped, len(transitions.sets.number), controls)
-    return pairs, None if pairs is None else _others(pairs, transitions, controls)
+    pairs = listed(dropped, len(transitions.sets.number), controls)
+    cells = transitions.sets.free
+    return pairs, None if pairs is None else others(pairs, transitions, controls, cells)
 
 
-def _listed(pairs: Any, cells: int, controls: int) -> NDArray[np.int64] | None:
+def listed(pairs: Any, cells: int, controls: int) -> NDArray[np.int64] | None:
+    """Return pairs (cell, control) in order, each once; None where there are none."""
     found = np.asarray([] if pairs is None else pairs)
     if found.size == 0:
         return None
@@ -45,8 +47,9 @@ def _listed(pairs: Any, cells: int, controls: int) -> NDArray[np.int64] | None:
     return np.unique(found, axis=0)
 
 
-def _others(pairs: Indices, transitions: Transitions, controls: int) -> Bools:
-    cell = transitions.sets.free[owner(transitions.pair_pointer)]
+def others(pairs: Indices, transitions: Transitions, controls: int, cells: Indices) -> Bools:
+    """Return which of the pairs of some cells are not among those given."""
+    cell = cells[owner(transitions.pair_pointer)]
     key = cell.astype(np.int64) * controls + transitions.control
     wanted = pairs[:, 0] * controls + pairs[:, 1]
     at = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
