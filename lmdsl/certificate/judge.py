@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,14 @@ class About(Enum):
     NO_POLICY = "all surviving pairs, where there is no policy"
 
 
+class Judged(NamedTuple):
+    """What sentences say of a model and a policy that are judged."""
+
+    gamma: float
+    cells: int  # of C
+    lost: Callable[[], int]  # number of cells from which the policy never reaches the attractor
+
+
 @dataclass(frozen=True, eq=False)
 class Claim:
     """A claim: an inequality between stored doubles (see claims.py)."""
@@ -38,7 +46,7 @@ class Claim:
     check: Callable[[StabilizationLP, Policy, Floats], Found]
     check_exactly: exact_checks.ExactCheck
     # the reason it gives in a certificate: where it does not hold; a refusal, where it does
-    sentence: Callable[[StabilizationLP, Policy | None, float | None], str]
+    sentence: Callable[["Judged", float | None], str]
     number: str | None = None  # the field of the certificate for its number
 
 
@@ -65,19 +73,20 @@ def _measure(lp: StabilizationLP, policy: Policy, mu: Floats) -> Found:
     return Found(holds, residual)
 
 
-def _not_stabilizing(lp: StabilizationLP, policy: Policy | None, number: float | None) -> str:
-    lost = 0 if policy is None else int((~reaches_attractor(lp, policy)).sum())
-    if lost and lp.gamma < 1:
+def _not_stabilizing(judged: Judged, number: float | None) -> str:
+    lost = judged.lost()
+    text = f"from {lost} of {judged.cells} cells the policy never reaches the attractor"
+    if lost and judged.gamma < 1:
         return (
-            f"from {lost} of {lp.n} cells the policy never reaches the attractor: at gamma = "
-            f"{lp.gamma!r} < 1 staying away can be cheaper than going; raise gamma to 1"
+            f"{text}: at gamma = {judged.gamma!r} < 1 staying away can be cheaper than going; "
+            "raise gamma to 1"
         )
     if lost:
-        return f"from {lost} of {lp.n} cells the policy never reaches the attractor"
+        return text
     return "no contraction of the policy could be proved: the numbers do not allow it"
 
 
-def _no_measure(lp: StabilizationLP, policy: Policy | None, residual: float | None) -> str:
+def _no_measure(judged: Judged, residual: float | None) -> str:
     text = "the Lyapunov measure could not be established"
     if residual is None:
         return text
@@ -106,7 +115,7 @@ MEASURE = Claim(
 REFUSAL = Claim(
     "refusal", About.NO_POLICY, "refusal",
     lambda lp, _, w: Found(checks.check_refusal(lp, w)), exact_checks.refusal,
-    lambda lp, *_: f"proved: no policy has finite cost at gamma = {lp.gamma!r}",
+    lambda judged, _: f"proved: no policy has finite cost at gamma = {judged.gamma!r}",
 )  # fmt: skip
 # In the order of certificate.json.
 CLAIMS = (STABILIZING, UPPER_BOUND, LOWER_BOUND, MEASURE, REFUSAL)
@@ -127,7 +136,7 @@ def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certific
             if (x := getattr(witness, claim.vector)) is not None
         }
 
-    asked = _asked(policy)
+    asked = _asked(policy is None)
     first = [claim for claim in asked if claim.about is About.POLICY]
     half = len(first) - len(first) // 2
     found: dict[str, Found] = {}
@@ -138,7 +147,8 @@ def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certific
     found |= judged(*(claim for claim in asked if claim not in first))
     known = _holds(found, UPPER_BOUND) and _holds(found, LOWER_BOUND)
     gap = checks.gap(lp, witness.V_up, witness.W) if known else None
-    return _certificate(lp, policy, found, gap, tolerance, safety.unproved(lp, policy))
+    unsafe = safety.unproved(lp, policy)
+    return certificate(lp, policy is None, found, gap, tolerance, unsafe, _judged(lp, policy))
 
 
 def exact_verdict(
@@ -159,13 +169,13 @@ def exact_verdict(
     }
     found = {
         claim.name: claim.check_exactly(model, vectors[claim.vector])
-        for claim in _asked(policy)
+        for claim in _asked(policy is None)
         if claim.vector in vectors
     }
     known = _holds(found, UPPER_BOUND) and _holds(found, LOWER_BOUND)
     gap = exact_checks.gap(lp, vectors["V_up"], vectors["W"]) if known else None
     unsafe = safety.unproved(lp, policy, guard)
-    return _certificate(lp, policy, found, gap, tolerance, unsafe)
+    return certificate(lp, policy is None, found, gap, tolerance, unsafe, _judged(lp, policy))
 
 
 def _policy(lp: StabilizationLP, witness: Witness) -> Policy | None:
@@ -173,8 +183,15 @@ def _policy(lp: StabilizationLP, witness: Witness) -> Policy | None:
     return policy if policy is not None and checks.is_policy(lp, policy) else None
 
 
-def _asked(policy: Policy | None) -> list[Claim]:
-    other = About.NO_POLICY if policy is not None else About.POLICY
+def _judged(lp: StabilizationLP, policy: Policy | None) -> Judged:
+    def lost() -> int:
+        return 0 if policy is None else int((~reaches_attractor(lp, policy)).sum())
+
+    return Judged(lp.gamma, lp.n, lost)
+
+
+def _asked(policyless: bool) -> list[Claim]:
+    other = About.POLICY if policyless else About.NO_POLICY
     return [claim for claim in CLAIMS if claim.about is not other]
 
 
@@ -182,14 +199,10 @@ def _holds(found: Mapping[str, Found], claim: Claim) -> bool:
     return found.get(claim.name, NOTHING).holds
 
 
-def _certificate(
-    lp: StabilizationLP,
-    policy: Policy | None,
-    found: Mapping[str, Found],
-    gap: float | None,
-    tolerance: float,
-    unsafe: int | None,
-) -> Certificate:
+def certificate(
+    lp: StabilizationLP, policyless: bool, found: Mapping[str, Found], gap: float | None,
+    tolerance: float, unsafe: int | None, judged: Judged,
+) -> Certificate:  # fmt: skip
     """Return what was found, with the reasons why it is not verified.
 
     ``unsafe`` is the number of cells of which claim 7 is not proved; None where it is not made.
@@ -203,13 +216,13 @@ def _certificate(
         gap = sums.stated_gap(gap, cost, lower)
     reasons = []
     if holds["refusal"]:
-        reasons.append(REFUSAL.sentence(lp, policy, None))
-    elif policy is None:
+        reasons.append(REFUSAL.sentence(judged, None))
+    elif policyless:
         reasons.append("there is no policy to verify")
     else:
         reasons += [
-            claim.sentence(lp, policy, found.get(claim.name, NOTHING).number)
-            for claim in _asked(policy)
+            claim.sentence(judged, found.get(claim.name, NOTHING).number)
+            for claim in _asked(policyless)
             if not holds[claim.name]
         ]
         if gap is not None and gap > tolerance:
@@ -217,7 +230,7 @@ def _certificate(
                 f"the gap {gap:.3g} is above the tolerance {tolerance:.3g}" + _too_small(cost)
             )
         if unsafe:
-            reasons.append(safety.sentence(lp, unsafe))
+            reasons.append(safety.sentence(judged.cells, unsafe))
     said: dict[str, Any] = {**holds, **numbers}
     assumes = lp.problem.system.assumes
     return Certificate(

@@ -16,14 +16,17 @@ from lmdsl.optimize.descent import MOST_LOWERED, backup_below
 from lmdsl.optimize.witness import LEAST_PASSES, MOST_PASSES, MOST_READ
 from lmdsl.ranks.verbs import Ranks
 
+NEAR = 1e-11  # relative distance from V at which a vector below it is looked for first
+
 
 def lower_vector(lp: StabilizationLP, V: Floats, tolerance: float, time_up: TimeUp) -> Floats:
     """Return W of claim 3 on own cells, as large as can be made from the value V; collective."""
     assert lp.mesh is not None
     ranks = lp.mesh.ranks
     found = _scaled(ranks, lp, V)
-    if found is None:
-        found = _lowered(ranks, lp, V * (1 - min(tolerance, 1e-6) / 4), time_up)
+    for margin in (NEAR, min(tolerance, 1e-6) / 4):
+        if found is None:
+            found = _lowered(ranks, lp, V * (1 - margin), time_up)
     raised = None
     if found is None or _above(ranks, lp, V, found, tolerance):
         raised = _raised(ranks, lp, time_up)

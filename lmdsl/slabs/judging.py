@@ -10,45 +10,53 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lmdsl.certificate import bounds, checks, sums
+from lmdsl.certificate import bounds, checks, safety, sums
 from lmdsl.certificate.bounds import _inflow
-from lmdsl.certificate.claims import Certificate, Witness
-from lmdsl.certificate.judge import REFUSAL
+from lmdsl.certificate.claims import Certificate, Found, Witness
+from lmdsl.certificate.judge import Judged, certificate
 from lmdsl.common.types import Floats, Policy
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.ranks.reading import Read, added
-from lmdsl.ranks.verbs import Ranks
+from lmdsl.ranks.verbs import RankError, Ranks
+from lmdsl.slabs.graph import levels
+from lmdsl.slabs.graph.levels import OwnRows
 
 
 def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certificate:
     """Judge a witness, of own cells and columns; collective, with one outcome for all ranks."""
     assert lp.mesh is not None
     judge = _Judge(lp.mesh.ranks, replace(lp, mesh=Read.again(lp.mesh)))
+    lost = 0
+    judged = Judged(lp.gamma, lp.mesh.division.cells, lambda: lost)
     if judge.refusal(witness):
-        return Certificate(
-            stabilizing=False, upper_bound=False, lower_bound=False, measure=False, refusal=True,
-            contraction=None, cost=None, lower=None, gap=None, measure_residual=None,
-            tolerance=tolerance, assumes=lp.problem.system.assumes,
-            reasons=(REFUSAL.sentence(lp, None, None),),
-        )  # fmt: skip
+        found = {"refusal": Found(True)}
+        return certificate(lp, True, found, None, tolerance, None, judged)
+    policyless = not judge.own_policy(witness.policy)
     contraction = judge.contraction(witness)
+    if contraction is None and not policyless:  # then it is looked for why
+        lost = _lost(lp, witness.policy)
     upper, lower = judge.upper(witness), judge.lower(witness.W)
     residual, measure = judge.measure(witness)
     cost = judge.weighed(witness.V_up, math.inf) if upper else None
+    upper = upper and cost is not None and cost < math.inf
     least = judge.weighed(witness.W, -math.inf) if lower else None
     gap = judge.gap(witness.V_up, witness.W) if upper and lower else None
-    holds = {
-        "stabilizing": contraction is not None, "upper_bound": upper,
-        "lower_bound": lower, "measure": measure,
+    found = {
+        "stabilizing": Found(contraction is not None, contraction),
+        "upper_bound": Found(upper, cost if upper else None),
+        "lower_bound": Found(lower, least), "measure": Found(measure, residual),
     }  # fmt: skip
-    reasons = [f"claim {name} does not hold" for name, it in holds.items() if not it]
-    if gap is not None and gap > tolerance:
-        reasons.append(f"the gap {gap:.3g} is above the tolerance {tolerance:.3g}")
-    return Certificate(
-        **holds, refusal=False, contraction=contraction, cost=cost, lower=least, gap=gap,
-        measure_residual=residual, tolerance=tolerance, reasons=tuple(reasons),
-        assumes=lp.problem.system.assumes,
-    )  # fmt: skip
+    unsafe = None if policyless else judge.unsafe(witness.policy)
+    return certificate(lp, policyless, found, gap, tolerance, unsafe, judged)
+
+
+def _lost(lp: StabilizationLP, policy: Policy | None) -> int:
+    """Return the number of cells from which a policy never reaches A; collective, no claim."""
+    assert lp.mesh is not None
+    assert policy is not None
+    known = OwnRows(np.arange(lp.n + 1, dtype=np.int64), lp.rows.take(policy))
+    level, _ = levels.tree(lp.mesh, known, np.ones(lp.n, dtype=np.bool_))
+    return sum(lp.mesh.ranks.collect(int((level < 0).sum())))
 
 
 @dataclass(frozen=True)
@@ -130,6 +138,21 @@ class _Judge:
         size = sums.total([s for _, s in every]) * (1 - 4 * bounds.UNIT)  # type: ignore[arg-type]
         allowed = checks.MEASURE_TOLERANCE * max(1.0, size) * (1 - 4 * bounds.UNIT)
         return (bound if math.isfinite(bound) else math.inf), bound <= allowed < math.inf
+
+    def unsafe(self, policy: Policy | None) -> int | None:
+        """Claim 7: of how many cells it is not proved; None where it is not made.
+
+        What cells are is asked of their owners, whatever compiling made of them.
+        """
+        ranks, lp = self.ranks, self.lp
+        if lp.problem.successors != "enclosed":
+            return None
+        parts = ranks.exchange(dict.fromkeys(range(ranks.count), lp.cell_status))
+        status = np.concatenate([*parts.values()])
+        if ranks.any(len(status) != lp.partition.size):
+            raise RankError(f"ranks have {len(status)} of {lp.partition.size} cells of the box")
+        found = ranks.agreed(lambda: safety.unproved(lp, policy, None, status))
+        return sum(k or 0 for k in ranks.collect(found))
 
     def to_owners(self, x: Floats) -> Floats:
         """Return what all ranks have for own cells, added up."""

@@ -10,8 +10,8 @@ from lmdsl.distributed.answering import Wanted, answer
 from lmdsl.ranks.threaded import as_threads
 
 WHOLE = ("control_index", "cell_status", "sure_levels")
-VECTORS = {"value": 1e-12, "lower": 1e-8, "measure": 1e-9}
-# Of numbers that rank sums round in another order; all other facts are the same.
+VECTORS = {"value": 1e-12, "lower": 1e-6, "measure": 1e-9}
+# Numbers that ranks sum in another order, or prove a little less of; all other facts are the same.
 CLOSE = {"cost", "lower_bound", "gap", "contraction"}
 
 
@@ -48,7 +48,7 @@ def require_alike(one, every):
         if name == "contraction":  # which depends on how far w was swept
             assert (near[name] is None) == (x is None)
         elif x is not None:
-            assert abs(near[name] - x) <= 1e-9 * max(abs(x), 1e-3)
+            assert abs(near[name] - x) <= 1e-6 * (1.0 if name == "gap" else abs(x))
     for other in every[1:]:
         assert facts(other) == facts(every[0])
         assert other.model_sha256 == every[0].model_sha256

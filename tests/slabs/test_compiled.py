@@ -189,20 +189,8 @@ def test_the_digest_tells_two_ghosts_that_are_swapped():
     assert right != wrong
 
 
-def test_what_does_not_run_over_ranks_is_refused_by_all():
+def test_ranks_with_different_problems_are_refused():
     problem = lm.load(EXAMPLES / "standard_map.json")
-    with pytest.raises(lm.BadInput, match=r"enclosed.*does not run over several ranks"):
-        as_threads(
-            2, lambda ranks: compiling.compiled(ranks, problem.replaced(successors="enclosed"))
-        )
-    for kind in ("hold", None):
-        held = problem.replaced(local_controller=kind and {"kind": kind})
-        program = functools.partial(compiling.compiled, problem=held)
-        if kind:
-            with pytest.raises(lm.BadInput, match=r"hold.*does not run over several ranks"):
-                as_threads(2, program)
-        else:
-            as_threads(2, program)
     with pytest.raises(RankError, match="different problems"):
         as_threads(2, lambda r: compiling.compiled(r, problem.replaced(gamma=1.0 + r.rank / 8)))
 

@@ -16,7 +16,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.estimates import unless_short
 from lmdsl.model.assembly.given import cut
 from lmdsl.model.assembly.sampler import Block, Sampler
-from lmdsl.model.assembly.transitions import assemble
+from lmdsl.model.assembly.transitions import Transitions, assemble
 from lmdsl.model.discretization import control_count
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local import holding
@@ -99,9 +99,7 @@ def assembled(
     )
     met = ranks.agreed(lambda: Successors.asked_for(problem, partition, own, deadline, cells=cells))
     pairs = ranks.agreed(lambda: listed(dropped, len(sets.number), control_count(problem)))
-    left = None if pairs is None else ranks.agreed(
-        lambda: others(_of_rank(pairs, sets, span, ranks.rank == 0), own, control_count(problem), cells)
-    )  # fmt: skip
+    left = ranks.agreed(lambda: _left(pairs, own, span, ranks.rank == 0))
     mesh = Mesh.of(ranks, division, own.rows.target)
     given = isinstance(problem.system, MatrixSystem)
     rows = replace(own.rows, target=_localised(mesh, own.rows, given), columns=mesh.columns)
@@ -126,14 +124,21 @@ def _sets(
     return sets, hold, holding.leaves_nothing(problem, hold)
 
 
-def _of_rank(
-    pairs: Indices, sets: CellSets, span: tuple[int, int], first: bool
-) -> Indices:  # fmt: skip
-    """Return the pairs of own free cells; the first rank's are also those of no free cell."""
+def _left(
+    pairs: Indices | None, own: Transitions, span: tuple[int, int], first: bool
+) -> Bools | None:
+    """Return which own pairs are not among those of all cells that are left out; None: all are.
+
+    Of cells that are not free the first rank says that they have no pair.
+    """
+    if pairs is None:
+        return None
+    sets = own.sets
     number = sets.number[pairs[:, 0]]
     strange = (number < 0) | (number >= len(sets.free))
-    own = (number >= span[0]) & (number < span[1]) & ~strange
-    return pairs[own | (strange & first)]
+    mine = (number >= span[0]) & (number < span[1]) & ~strange
+    controls = int(max(pairs[:, 1].max(), own.control.max(initial=0))) + 1
+    return others(pairs[mine | (strange & first)], own, controls, sets.free[slice(*span)])
 
 
 def _localised(mesh: Mesh, rows: Rows, given: bool) -> NDArray[np.int32]:
