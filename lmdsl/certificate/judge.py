@@ -26,7 +26,7 @@ class About(Enum):
     NO_POLICY = "all surviving pairs, where there is no policy"
 
 
-class Judged(NamedTuple):
+class OnTrial(NamedTuple):
     """What sentences say of a model and a policy that are judged."""
 
     gamma: float
@@ -46,7 +46,7 @@ class Claim:
     check: Callable[[StabilizationLP, Policy, Floats], Found]
     check_exactly: exact_checks.ExactCheck
     # the reason it gives in a certificate: where it does not hold; a refusal, where it does
-    sentence: Callable[["Judged", float | None], str]
+    sentence: Callable[["OnTrial", float | None], str]
     number: str | None = None  # the field of the certificate for its number
 
 
@@ -73,7 +73,7 @@ def _measure(lp: StabilizationLP, policy: Policy, mu: Floats) -> Found:
     return Found(holds, residual)
 
 
-def _not_stabilizing(judged: Judged, number: float | None) -> str:
+def _not_stabilizing(judged: OnTrial, number: float | None) -> str:
     lost = judged.lost()
     text = f"from {lost} of {judged.cells} cells the policy never reaches the attractor"
     if lost and judged.gamma < 1:
@@ -86,7 +86,7 @@ def _not_stabilizing(judged: Judged, number: float | None) -> str:
     return "no contraction of the policy could be proved: the numbers do not allow it"
 
 
-def _no_measure(judged: Judged, residual: float | None) -> str:
+def _no_measure(judged: OnTrial, residual: float | None) -> str:
     text = "the Lyapunov measure could not be established"
     if residual is None:
         return text
@@ -183,11 +183,11 @@ def _policy(lp: StabilizationLP, witness: Witness) -> Policy | None:
     return policy if policy is not None and checks.is_policy(lp, policy) else None
 
 
-def _judged(lp: StabilizationLP, policy: Policy | None) -> Judged:
+def _judged(lp: StabilizationLP, policy: Policy | None) -> OnTrial:
     def lost() -> int:
         return 0 if policy is None else int((~reaches_attractor(lp, policy)).sum())
 
-    return Judged(lp.gamma, lp.n, lost)
+    return OnTrial(lp.gamma, lp.n, lost)
 
 
 def _asked(policyless: bool) -> list[Claim]:
@@ -201,7 +201,7 @@ def _holds(found: Mapping[str, Found], claim: Claim) -> bool:
 
 def certificate(
     lp: StabilizationLP, policyless: bool, found: Mapping[str, Found], gap: float | None,
-    tolerance: float, unsafe: int | None, judged: Judged,
+    tolerance: float, unsafe: int | None, judged: OnTrial,
 ) -> Certificate:  # fmt: skip
     """Return what was found, with the reasons why it is not verified.
 

@@ -13,7 +13,7 @@ import numpy as np
 from lmdsl.certificate import bounds, checks, safety, sums
 from lmdsl.certificate.bounds import _inflow
 from lmdsl.certificate.claims import Certificate, Found, Witness
-from lmdsl.certificate.judge import Judged, certificate
+from lmdsl.certificate.judge import OnTrial, certificate
 from lmdsl.common.types import Floats, Policy
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.ranks.reading import Read, added
@@ -27,7 +27,7 @@ def verdict(lp: StabilizationLP, witness: Witness, tolerance: float) -> Certific
     assert lp.mesh is not None
     judge = _Judge(lp.mesh.ranks, replace(lp, mesh=Read.again(lp.mesh)))
     lost = 0
-    judged = Judged(lp.gamma, lp.mesh.division.cells, lambda: lost)
+    judged = OnTrial(lp.gamma, lp.mesh.division.cells, lambda: lost)
     if judge.refusal(witness):
         found = {"refusal": Found(True)}
         return certificate(lp, True, found, None, tolerance, None, judged)
