@@ -15,13 +15,13 @@ The certificate does not see a wrong ghost: claims about wrong numbers hold too.
 """
 
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Indices
-from lmdsl.machine.kernels import kernel
+from lmdsl.common.types import Bools, Indices
+from lmdsl.ranks.numbering import localised, seen
 from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.verbs import RankError, Ranks
 
@@ -55,17 +55,53 @@ class Halo:
 
         Every message ends with the plan and how often it was used, in bytes of the same kind.
         """
+        for of, came in self._carried(x, self.send, self.slots).items():
+            x[self.slots[of]] = came
+
+    def add(self, x: NDArray[Any]) -> None:
+        """Add the values of the ghosts of x to those of their own cells, the other way; collective.
+
+        They are added in the order of ranks.
+        """
+        for to, came in self._carried(x, self.slots, self.send).items():
+            x[self.send[to]] += came
+
+    def _carried(
+        self, x: NDArray[Any], out: dict[int, LocalNumbers], into: dict[int, LocalNumbers]
+    ) -> dict[int, NDArray[Any]]:
+        """Send parts of x, and return what comes for others, by rank."""
         self.spreads += 1
         stamp = _stamp(self.number, self.spreads, x.dtype)
-        parcels = {to: np.concatenate([x[cells], stamp]) for to, cells in self.send.items()}
-        sizes = {of: len(slots) + len(stamp) for of, slots in self.slots.items()}
+        parcels = {to: np.concatenate([x[cells], stamp]) for to, cells in out.items()}
+        sizes = {of: len(slots) + len(stamp) for of, slots in into.items()}
+        found = {}
         for of, came in self.ranks.exchange(parcels, sizes, x.dtype).items():
-            end = len(self.slots[of])
+            end = len(into[of])
             if came[end:].tobytes() != stamp.tobytes():
                 raise RankError(
                     f"rank {of} sent rank {self.ranks.rank} values of another time or plan"
                 )
-            x[self.slots[of]] = came[:end]
+            found[of] = came[:end]
+        return found
+
+    def parted(self, kind: NDArray[np.unsignedinteger], count: int) -> "list[Halo]":
+        """Return ``count + 1`` plans: of cells of each kind, 0 to count - 1, then of the others.
+
+        ``kind`` is that of own cells and ghosts, and known on both sides.
+        """
+        parts = [
+            Halo(self.ranks, self.number, {}, {}, (k + 1) << 20)  # so that stamps differ
+            for k in range(count + 1)
+        ]
+        for to in self.send:
+            for part, cells in zip(parts, _parted(self.send[to], kind, count), strict=True):
+                if len(cells):
+                    part.send[to] = cells
+        for of in self.slots:
+            for part, cells in zip(parts, _parted(self.slots[of], kind, count), strict=True):
+                if len(cells):
+                    part.slots[of] = cells
+        return parts
 
     @property
     def size(self) -> int:
@@ -100,10 +136,8 @@ class Mesh:
         Numbers of own cells, and of the attractor (``division.cells``), are passed over.
         """
         division.confirm(ranks)
-        seen = np.zeros(division.cells // 8 + 1, dtype=np.uint8)  # a bit for each cell
-        known = bool(_see(np.asarray(named), *division.own(ranks.rank), division.cells, seen))
-        ghosts = _seen(seen)
-        if not ranks.all(known):
+        ghosts = seen(named, *division.own(ranks.rank), division.cells)
+        if not ranks.all(ghosts is not None) or ghosts is None:
             raise RankError(f"rows of a rank name cells outside 0..{division.cells - 1}")
         mesh = cls(ranks, division, ghosts)
         mesh.halo = mesh.plan(np.arange(len(ghosts)))
@@ -133,11 +167,9 @@ class Mesh:
 
         They are written ``into`` an array where one is given, which may be that of the cells.
         """
-        first, last = self.division.own(self.ranks.rank)
-        cells = np.asarray(cells)
         found = np.empty(len(cells), dtype=np.int32) if into is None else into
-        places = _Places(first, last, self.division.cells, self.ghosts, *_buckets(self.ghosts))
-        if not _localise(cells, places, found):
+        own = self.division.own(self.ranks.rank)
+        if not localised(cells, *own, self.division.cells, self.ghosts, found):
             raise RankError(f"rank {self.ranks.rank} has no ghost for a cell that its rows name")
         return found
 
@@ -166,7 +198,8 @@ class Mesh:
 
     def confirm(self, halo: Halo, slots: NDArray[np.integer]) -> None:
         """Refuse a plan by which some ghost does not get the number of its own cell; collective."""
-        numbers = self.numbers
+        small = self.division.cells < 2**31
+        numbers = self.numbers.astype(np.int32 if small else np.int64, copy=False)
         told = numbers.copy()
         told[self.own : -1] = -1
         halo.fill(told)
@@ -181,8 +214,31 @@ class Mesh:
 
     def for_rows(self, targets: NDArray[np.integer]) -> Halo:
         """Return the plan of the ghosts that some rows name, by local numbers; collective."""
-        named = np.unique(np.asarray(targets, dtype=np.int64)) - self.own
-        return self.plan(named[(named >= 0) & (named < len(self.ghosts))])
+        named = np.asarray(targets, dtype=np.int64)
+        wanted = np.zeros(self.columns + 1, dtype=np.bool_)
+        wanted[named] = True
+        return self.narrowed(wanted[:-1])
+
+    def narrowed(self, wanted: Bools) -> Halo:
+        """Return the plan of some ghosts, marked by local numbers, and confirm it; collective.
+
+        Owners are told by a bit for each ghost of the plan of all.
+        """
+        self.plans += 1
+        whole = self.halo
+        asked = {of: np.packbits(wanted[slots]) for of, slots in whole.slots.items()}
+        sizes = {to: (len(cells) + 7) // 8 for to, cells in whole.send.items()}
+        send = {}
+        for to, bits in self.ranks.exchange(asked, sizes, np.uint8).items():
+            cells = whole.send[to]
+            send[to] = cells[np.unpackbits(bits, count=len(cells)).view(np.bool_)]
+        slots = {of: slots[wanted[slots]] for of, slots in whole.slots.items()}
+        halo = Halo(
+            self.ranks, self.plans, {to: cells for to, cells in send.items() if len(cells)},
+            {of: ghosts for of, ghosts in slots.items() if len(ghosts)},
+        )  # fmt: skip
+        self.confirm(halo, self.own + np.flatnonzero(wanted[self.own :]))
+        return halo
 
     def require_covered(self, halo: Halo, targets: NDArray[np.integer]) -> None:
         """Refuse a plan that leaves out a ghost that rows name, by local numbers."""
@@ -194,24 +250,6 @@ class Mesh:
         if len(bad):
             cell = self.numbers[targets[bad[0]]]
             raise RankError(f"rank {self.ranks.rank} reads cell {cell}, which nobody sends")
-
-    def tell(self, x: NDArray[np.float64], halo: Halo, told: dict[int, NDArray[np.bool_]]) -> None:
-        """Tell others the values that are known by now, not NaN, each once; collective.
-
-        x has the values of own cells and ghosts; ``told`` is who knows which, nothing at first.
-        Values come with the numbers of their cells.
-        """
-        first, _ = self.division.own(self.ranks.rank)
-        parcels = {}
-        for to, cells in halo.send.items():
-            known = ~np.isnan(x[cells])
-            news = cells[known & ~told.get(to, np.zeros(len(cells), dtype=np.bool_))]
-            told[to] = known
-            if len(news):
-                parcels[to] = np.concatenate([(news + first).astype(np.float64), x[news]])
-        for came in self.ranks.exchange(parcels).values():
-            numbers, values = np.split(came, 2)
-            x[self.local(numbers.astype(np.int64))] = values
 
     def spread(
         self, own: NDArray[Any], attractor: Any = 0.0, halo: Halo | None = None
@@ -227,73 +265,13 @@ class Mesh:
         return x
 
 
-@kernel
-def _see(named, first, last, end, seen):  # type: ignore[no-untyped-def]
-    """Set the bits of cells that are not own; False where one is no cell and not the attractor."""
-    for e in range(len(named)):
-        cell = named[e]
-        if (cell < first or cell >= last) and cell != end:
-            if cell < 0 or cell > end:
-                return False
-            seen[cell >> 3] |= np.uint8(1 << (cell & 7))
-    return True
-
-
-def _seen(seen: NDArray[np.uint8]) -> Indices:
-    """Return the numbers of bits that are set, ascending."""
-    some = np.flatnonzero(seen)
-    place, bit = np.nonzero(np.unpackbits(seen[some, None], axis=1, bitorder="little"))
-    return some[place].astype(np.int64) * 8 + bit
-
-
-class _Places(NamedTuple):
-    """Own cells and ghosts; of every bucket of 2^shift cells from ``low`` its first ghost."""
-
-    first: int
-    last: int
-    end: int  # the attractor
-    ghosts: Indices
-    low: int
-    shift: int
-    start: Indices
-
-
-def _buckets(ghosts: Indices) -> tuple[int, int, Indices]:
-    """Return where to look for ghosts: about as many buckets as there are ghosts."""
-    if not len(ghosts):
-        return 0, 0, np.zeros(1, dtype=np.int64)
-    low, span = int(ghosts[0]), int(ghosts[-1] - ghosts[0]) + 1
-    shift = max(0, (span // (2 * len(ghosts))).bit_length())
-    starts = low + (np.arange((span >> shift) + 2, dtype=np.int64) << shift)
-    return low, shift, np.searchsorted(ghosts, starts).astype(np.int64)
-
-
-@kernel
-def _localise(cells, places, found):  # type: ignore[no-untyped-def]
-    """Write local numbers; False where a cell is not own, no ghost and not the attractor."""
-    first, last, end, ghosts, least, shift, start = places
-    own = last - first
-    for e in range(len(cells)):
-        cell = np.int64(cells[e])
-        if first <= cell < last:
-            found[e] = cell - first
-        elif cell == end:
-            found[e] = own + len(ghosts)
-        else:
-            bucket = (cell - least) >> shift
-            if bucket < 0 or bucket + 1 >= len(start):
-                return False
-            low, high = start[bucket], start[bucket + 1]
-            while low < high:
-                middle = (low + high) // 2
-                if ghosts[middle] < cell:
-                    low = middle + 1
-                else:
-                    high = middle
-            if low == len(ghosts) or ghosts[low] != cell:
-                return False
-            found[e] = own + low
-    return True
+def _parted(
+    cells: LocalNumbers, kind: NDArray[np.unsignedinteger], count: int
+) -> list[LocalNumbers]:
+    """Return the cells of each kind, in order, then those of none."""
+    own = kind[cells]
+    order = np.argsort(own, kind="stable")
+    return np.split(cells[order], np.searchsorted(own[order], np.arange(1, count + 1)))
 
 
 def _nothing(kind: np.dtype[Any]) -> Any:

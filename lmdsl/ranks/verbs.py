@@ -149,7 +149,7 @@ class Ranks(ABC):
 
     def time_up(self, own: TimeUp) -> TimeUp:
         """Return a question that all ranks ask together, and that all answer alike."""
-        return lambda: self.any(own())
+        return Together(self, own)
 
     def agreed(self, work: Callable[[], Item]) -> Item:
         """Return ``work()``, in which no verb is said; its error is raised on every rank.
@@ -211,6 +211,18 @@ class Ranks(ABC):
 
     @abstractmethod
     def _collect(self, item: Item) -> list[Item]: ...
+
+
+@dataclass(frozen=True)
+class Together:
+    """A question that all ranks ask together, and that all answer alike."""
+
+    ranks: Ranks
+    own: TimeUp  # what this rank asks for itself
+
+    def __call__(self) -> bool:
+        """Return whether any rank answers yes."""
+        return self.ranks.any(self.own())
 
 
 class Alone(Ranks):

@@ -7,7 +7,7 @@ import numpy as np
 
 from lmdsl.common.types import Floats, Policy, TimeUp
 from lmdsl.machine.deadline import Stopped
-from lmdsl.optimize.policies.iteration import TIE
+from lmdsl.optimize.policies.iteration import FEW, TIE
 from lmdsl.optimize.policies.screening import Screen, _least_ratio
 from lmdsl.ranks.verbs import RankError
 from lmdsl.slabs.chains.evaluating import Evaluator
@@ -25,19 +25,25 @@ def iterated(
     will do; only one evaluated to the end is returned.
     """
     lp, ranks = first.lp, first.mesh.ranks
-    screen, steps = Screen(lp), 0
+    screen, steps, unevaluated = Screen(lp), 0, False
     last: tuple[Policy, Floats] | None = None
     while True:
         done = screen.improve(V, policy, TIE)
         changed = sum(ranks.collect(done.changed))
-        if last is not None and (not changed or time_up()):
+        out = time_up()
+        if last is not None and (not changed or out):
             return *last, screen, steps
         steps += changed > 0
-        lower = by.lower(done.policy, done.value) if changed and not time_up() else None
+        # As one process: passes read less than an evaluation where few controls change.
+        few = steps == 1 or changed * FEW < first.mesh.division.cells
+        unevaluated = changed > 0 and few and not unevaluated and not out
+        lower = done.value if unevaluated else None
+        if changed and not unevaluated and not out:
+            lower = by.lower(done.policy, done.value, screen)
         before, last = last, None
         if lower is None:
             try:
-                lower = by.value(done.policy, done.value)
+                lower = by.value(done.policy, done.value, screen)
             except Stopped:  # on all ranks
                 return *(before or (policy, V)), screen, steps
             _require_fallen(first, V, lower)

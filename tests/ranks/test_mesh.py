@@ -123,24 +123,41 @@ def test_a_plan_of_some_ghosts_leaves_the_others_nan(count):
     assert sum(as_threads(count, program)) > 0
 
 
-@pytest.mark.parametrize("count", [2, 3, 7])
-def test_values_are_told_once_as_they_become_known(count):
+@pytest.mark.parametrize("count", COUNTS)
+def test_plans_by_kind_carry_values_once_and_back(count):
     def program(ranks):
         mesh, *_ = own_rows(ranks)
-        numbers, told = mesh.numbers.astype(float), {}
+        kind = mesh.spread((mesh.numbers[: mesh.own] % 4).astype(np.uint16), 0)
+        parts = mesh.halo.parted(kind, 3)
         x = np.full(mesh.columns + 1, np.nan)
-        sent = []
-        for known in (3, 2, 2, 1):  # every third cell, then every second, then all
-            at = np.arange(mesh.own)[mesh.numbers[: mesh.own] % known == 0]
-            x[at] = numbers[at]
-            before = ranks.traffic.sent
-            mesh.tell(x, mesh.halo, told)
-            sent.append(ranks.traffic.sent - before)
-        assert (x[:-1] == numbers[:-1]).all()
-        assert sent[2] == 0
-        assert sum(sent) == 16 * sum(map(len, mesh.halo.send.values()))
+        x[: mesh.own], x[-1] = mesh.numbers[: mesh.own], mesh.numbers[-1]
+        for k, part in enumerate(parts):
+            part.fill(x)
+            known = (kind <= k) | (np.arange(mesh.columns + 1) < mesh.own)
+            known[-1] = True
+            assert (np.isnan(x) == ~known).all()
+        assert (x == mesh.numbers).all()
+        sums = np.ones(mesh.columns + 1)
+        for part in parts:
+            part.add(sums)
+        times = np.ones(mesh.own)
+        for cells in mesh.halo.send.values():
+            times[cells] += 1
+        assert (sums[: mesh.own] == times).all()
 
     as_threads(count, program)
+
+
+def test_values_of_another_part_of_a_plan_are_refused():
+    def program(ranks):
+        mesh, *_ = own_rows(ranks)
+        kind = np.zeros(mesh.columns, dtype=np.uint16)
+        parts = mesh.halo.parted(kind, 1)
+        mine = parts[0] if ranks.rank else mesh.halo
+        mine.fill(np.zeros(mesh.columns + 1))
+
+    with pytest.raises(RankError, match="values of another time or plan"):
+        as_threads(3, program)
 
 
 # Negative controls: what a wrong plan would do to the answer, no claim sees.

@@ -1,7 +1,8 @@
 """Who evaluates the policies of a model that is spread over ranks: rank 0, or all together.
 
-Rank 0 gets the rows of a policy and uses the code of one process, to its bits. From some size on
-the rows of a policy are too many for it; then all ranks sweep, and no rank has more than its own.
+Of a small model rank 0 gets the rows of a policy and uses the code of one process, to its bits.
+From some size on all ranks substitute, and only the core is solved by rank 0; no rank has more than
+its own rows and the core.
 """
 
 from dataclasses import dataclass, field
@@ -16,16 +17,19 @@ from lmdsl.common.types import Floats, Policy, TimeUp, never
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.feasibility import first_policy
-from lmdsl.optimize.linear.gauss_seidel import CEILING
+from lmdsl.optimize.linear.gauss_seidel import CEILING, TOLERANCE
+from lmdsl.optimize.linear.policy_system import Slots
 from lmdsl.optimize.policies import evaluation, iteration
+from lmdsl.optimize.policies.screening import Screen
 from lmdsl.optimize.witness import _first_try
 from lmdsl.ranks.mesh import Mesh
 from lmdsl.slabs import below
-from lmdsl.slabs.chains import peeling
 from lmdsl.slabs.chains.first import First
+from lmdsl.slabs.chains.peeling import SpreadPeeled
 
-MOST_GATHERED = 10**6  # cells up to which rank 0 evaluates
-FEW = 12  # sweeps of a core by which a value is lowered between two passes
+MOST_GATHERED = 10_000  # cells up to which rank 0 evaluates: messages take longer than the work
+FEW = 12  # sweeps by which a value is lowered between two passes
+MOST_GUESSED = 1e-7  # relative slack above which a lower bound is not made of a policy's own rows
 
 
 class Evaluator(Protocol):
@@ -34,11 +38,11 @@ class Evaluator(Protocol):
     def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
         """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
 
-    def lower(self, policy: Policy, V: Floats) -> Floats | None:
+    def lower(self, policy: Policy, V: Floats, screen: Screen) -> Floats | None:
         """Return a lower V >= T_u V for V >= T_u V; None where the value is as soon known."""
 
-    def value(self, policy: Policy, start: Floats) -> Floats:
-        """Return the value of a g-stabilizing policy."""
+    def value(self, policy: Policy, start: Floats, screen: Screen | None = None) -> Floats:
+        """Return the value of a g-stabilizing policy; its rows may be in a screen."""
 
     def witness(self, policy: Policy, V: Floats, tolerance: float) -> Witness:
         """Return the vectors of a policy's claims, made from its own rows; V is its value."""
@@ -50,7 +54,7 @@ class ByFirst:
 
     first: First
 
-    def lower(self, policy: Policy, V: Floats) -> Floats | None:
+    def lower(self, policy: Policy, V: Floats, screen: Screen) -> Floats | None:
         """Return None."""
         return None
 
@@ -75,7 +79,7 @@ class ByFirst:
             self.first.mesh.ranks.agreed(lambda: found() if self.first.here else None)
         )
 
-    def value(self, policy: Policy, start: Floats) -> Floats:
+    def value(self, policy: Policy, start: Floats, screen: Screen | None = None) -> Floats:
         """Return the value of a g-stabilizing policy."""
         under, near = self.first.model(policy), self.first.gathered(start)
 
@@ -109,22 +113,38 @@ class ByFirst:
 
 
 @dataclass(frozen=True)
+class Known:
+    """The chain of a policy; its rows may lie in the slots of a screen, until they change."""
+
+    policy: Policy
+    chain: SpreadPeeled
+    slots: Slots | None
+
+    def serves(self, policy: Policy) -> bool:
+        """Return whether it is the chain of a policy still."""
+        at_hand = self.slots is None or np.array_equal(self.slots.chosen, policy.view(np.uint64))
+        return bool(at_hand and np.array_equal(self.policy, policy))
+
+
+@dataclass(frozen=True)
 class ByAll:
-    """All ranks evaluate, by sweeps."""
+    """All ranks evaluate: by substitution, and the core of the chain apart."""
 
     lp: StabilizationLP
     time_up: TimeUp
-    # gamma: the last policy, and its chain
-    last: dict[float, tuple[Policy, peeling.SpreadPeeled]] = field(default_factory=dict)
+    last: dict[float, Known] = field(default_factory=dict)  # by gamma
 
-    def chain(self, policy: Policy, gamma: float) -> peeling.SpreadPeeled:
+    def chain(self, policy: Policy, gamma: float, screen: Screen | None = None) -> SpreadPeeled:
         """Return gamma P_u; the last one is kept."""
         known = self.last.get(gamma)
-        same = known is not None and np.array_equal(known[0], policy)
-        if self.mesh.ranks.all(same) and known is not None:
-            return known[1]
-        self.last[gamma] = policy.copy(), peeling.of_chain(self.lp, policy, gamma)
-        return self.last[gamma][1]
+        if self.mesh.ranks.all(known is not None and known.serves(policy)) and known is not None:
+            return known.chain
+        self.last.pop(gamma, None)
+        slots = screen.slots if screen is not None and screen.gamma == gamma else None
+        rows = None if slots is None else slots.system(policy)
+        chain = SpreadPeeled.of_chain(self.lp, policy, gamma, rows)
+        self.last[gamma] = Known(policy.copy(), chain, slots)
+        return chain
 
     @property
     def mesh(self) -> Mesh:
@@ -132,18 +152,24 @@ class ByAll:
         assert self.lp.mesh is not None
         return self.lp.mesh
 
-    def stable(self, policy: Policy, guess: Floats | None) -> tuple[Floats, Floats] | None:
-        """Return w > 0, d > 0 with w >= g P_u w + d; None where there is none in sight."""
-        unit = np.ones(self.lp.n)
+    def stable(
+        self, policy: Policy, guess: Floats | None, cost: Floats | None = None
+    ) -> tuple[Floats, Floats] | None:
+        """Return w > 0, d > 0 with w >= g P_u w + d; None where there is none in sight.
+
+        It comes from a guess towards the value under unit cost, or another one that is positive.
+        """
+        b = np.ones(self.lp.n) if cost is None else cost
         system = self.chain(policy, self.lp.growth)
-        w = unit.copy() if guess is None else np.maximum(guess, 1.0)
+        w = b.copy() if guess is None else np.maximum(guess, b)
         for _ in range(first_policy.MOST_ROUNDS):  # it need not be solved to the end
-            if not system.advance(unit, w, first_policy.SWEEPS, 1e-2) < np.inf:
-                return None
-            found = self.proof(policy, w)
-            if found is not None:
-                return found
-        solved = system.solve(unit, w, self.time_up)
+            change = system.advance(b, w, first_policy.SWEEPS, 1e-2 if cost is None else 0.0)
+            found = self.proof(policy, w) if change < np.inf else None
+            if found is not None or not change > TOLERANCE or not change < np.inf:
+                break
+        if found is not None or not change < np.inf:
+            return found
+        solved = system.solve(b, w, self.time_up)
         return None if solved is None else self.proof(policy, solved)
 
     def proof(self, policy: Policy, w: Floats) -> tuple[Floats, Floats] | None:
@@ -156,24 +182,27 @@ class ByAll:
 
     def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
         """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
-        found = self.stable(policy, guess)
+        cost, found = self.lp.cost[policy], None
+        if guess is not None and self.mesh.ranks.all(bool((cost > 0).all())):
+            found = self.stable(policy, guess, cost)  # then V is close to the value
+        found = found or self.stable(policy, guess)
         if found is None:
             return None
         w, d = found
         with np.errstate(over="ignore"):
-            own = float((self.lp.cost[policy] / d).max(initial=0.0))
+            own = float((cost / d).max(initial=0.0))
             V = w * (max(self.mesh.ranks.collect(own)) * (1 + 1e-12))
         return None if self.mesh.ranks.any(not (V < CEILING).all()) else V
 
-    def lower(self, policy: Policy, V: Floats) -> Floats | None:
+    def lower(self, policy: Policy, V: Floats, screen: Screen) -> Floats | None:
         """Return V after a few sweeps of the core, exact outside."""
         x = V.copy()
-        chain = self.chain(policy, self.lp.gamma)
+        chain = self.chain(policy, self.lp.gamma, screen)
         return np.minimum(x, V) if chain.advance(self.lp.cost[policy], x, FEW, 0.0) < np.inf else V
 
-    def value(self, policy: Policy, start: Floats) -> Floats:
+    def value(self, policy: Policy, start: Floats, screen: Screen | None = None) -> Floats:
         """Return the value of a g-stabilizing policy."""
-        system = self.chain(policy, self.lp.gamma)
+        system = self.chain(policy, self.lp.gamma, screen)
         V = system.solve(self.lp.cost[policy], start, self.time_up)
         if V is None:
             raise Stopped
@@ -184,12 +213,22 @@ class ByAll:
         lp, ranks = self.lp, self.mesh.ranks
         w, d = self.stable(policy, None) or (None, None)
         V_up = None if w is None or d is None else self._above(policy, V, w, d)
-        W = below.lower_vector(lp, V, tolerance, self.time_up)
-        chain = self.chain(policy, lp.gamma)
-        turned = peeling.transposed(chain, lp.cells, lp.partition.shape)
+        W = self._guessed(policy, V, tolerance)
+        W = below.lower_vector(lp, V, tolerance, self.time_up) if W is None else W
         flat = 1e-2 * MEASURE_TOLERANCE / sum(ranks.collect(lp.n))
-        mu = peeling.solve_transposed(turned, lp.weight, self.time_up, flat)
+        mu = self.chain(policy, lp.gamma).solve_transposed(lp.weight, self.time_up, flat)
         return Witness(policy, w, V_up, W, mu)
+
+    def _guessed(self, policy: Policy, V: Floats, tolerance: float) -> Floats | None:
+        """Return (1 - eps) V as one process guesses it from a policy's own rows; rarely too small.
+
+        Where it does not serve the judge says so.
+        """
+        every = self.mesh.ranks.collect(bounds.worst_excess(self.lp.under(policy), V))
+        eps = 2 * max(worst for worst, _ in every) + bounds.UNIT
+        if any(infinite for _, infinite in every) or not eps < min(tolerance / 4, MOST_GUESSED):
+            return None
+        return V * (1 - eps)
 
     def _above(self, policy: Policy, V: Floats, w: Floats, d: Floats) -> Floats | None:
         """Return V + delta w that is an upper bound, as one process makes it."""

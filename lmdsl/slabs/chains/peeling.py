@@ -3,27 +3,34 @@
 As in ``optimize/linear/substitution.py`` cells to which none leads are taken away, then those to
 which only these lead, and so on; what is left is the core. Which cells these are does not depend on
 the order, so each rank goes as far as it can with what it knows, and then all tell each other: a
-round for each time that a way crosses from rank to rank, not one for each level. The value of a
-cell is the same formula of the values that it leads to whenever it is made: the same bits.
+*round* for each time that a way crosses from rank to rank, not one for each level. An owner is told
+of its cell once by every rank whose cells lead to it, when the last of these is gone.
 
-Of the transposed system the values of the cells outside are known first, from those that lead to
-them; then the core follows.
+Values come the other way. A cell of a round leads to own cells that are later in the order, and to
+cells of others that are of later rounds, or to the core: so with one message between two rounds, of
+the values of the cells of a round, each is made once, in the order of the rounds turned round. It
+is the same formula of the values that a cell leads to whenever it is made: the same bits. Of the
+transposed system values flow with the rounds, what flows to cells of others is added by them, and
+the core comes last.
 """
 
-from dataclasses import dataclass, replace
-from typing import Self
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Indices, TimeUp
-from lmdsl.machine.kernels import kernel
+from lmdsl.machine.kernels import ONE, kernel
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.optimize.linear.gauss_seidel import CEILING, NEVER, SplitMatrix
+from lmdsl.optimize.linear.gauss_seidel import SplitMatrix
 from lmdsl.optimize.linear.policy_system import of_policy
-from lmdsl.ranks.mesh import Mesh
+from lmdsl.optimize.linear.substitution import BYTE, FAR, WORD, CellNumbers, _back, _down
+from lmdsl.ranks.mesh import Halo, Mesh
 from lmdsl.ranks.verbs import RankError
-from lmdsl.slabs.chains.sweeping import SpreadSystem
+from lmdsl.slabs.chains.core import Core, GatheredCore, Rows, SweptCore
+
+MOST_CORE = 10**6  # cells of a core up to which rank 0 solves it
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,173 +39,161 @@ class SpreadPeeled:
 
     Attributes
     ----------
-    whole
-        The system of all cells.
-    order
-        Own cells outside the core, in an order in which each stands before all it leads to.
+    mesh, system
+        Own cells and ghosts, and the rows of own cells.
+    order, ends
+        Own cells outside the core, each before all it leads to; where each round ends.
+    crossing
+        The plan of the ghosts of every round, and that of those in the core.
     core
         Which own cells are the core, shape (own,).
     inner
-        The system of the core, its cells numbered anew.
+        The system of the core; None where no rank has any of it.
     """
 
-    whole: SpreadSystem
-    order: NDArray[np.uint32]
+    mesh: Mesh
+    system: SplitMatrix
+    order: CellNumbers
+    ends: list[int]
+    crossing: list[Halo]
     core: Bools
-    inner: SpreadSystem
+    inner: Core | None
 
     @classmethod
-    def of(cls, whole: SpreadSystem, cells: Indices, shape: tuple[int, ...]) -> Self:
+    def of(cls, mesh: Mesh, system: SplitMatrix, cells: Indices, shape: tuple[int, ...]) -> Self:
         """Find the core; ``cells`` are the own ones by their index in a box. Collective."""
-        order = _outside(whole)
-        core = np.ones(whole.mesh.own, dtype=np.bool_)
+        order, ends, crossing = _rounds(mesh, system)
+        core = np.ones(mesh.own, dtype=np.bool_)
         core[order] = False
-        return cls(whole, order, core, _among(whole, core, cells, shape))
+        rows = Rows.of(mesh, system, core, crossing[-1], cells)
+        inner: Core | None = None
+        size = rows.division.cells
+        if 0 < size <= MOST_CORE:
+            inner = GatheredCore.of(mesh.ranks, rows, shape, mesh.division.cells)
+        elif size:
+            inner = SweptCore.of(mesh.ranks, rows, shape)
+        return cls(mesh, system, order, ends, crossing, core, inner)
+
+    @classmethod
+    def of_chain(
+        cls, lp: StabilizationLP, policy: Indices, gamma: float, system: SplitMatrix | None = None
+    ) -> Self:
+        """Return gamma P_u for a policy of own columns, made where it is not given; collective."""
+        assert lp.mesh is not None
+        system = of_policy(lp, policy, gamma) if system is None else system
+        return cls.of(lp.mesh, system, lp.cells, lp.partition.shape)
+
+    @property
+    def _parts(self) -> list[CellNumbers]:
+        """The cells of each round."""
+        return np.split(self.order, self.ends[:-1])
 
     def solve(self, b: Floats, x: Floats, time_up: TimeUp) -> Floats | None:
         """Return x >= 0 with x = b + M x from a guess; None where none is in sight. Collective."""
-        y = self.inner.solve(b[self.core], x[self.core], time_up)
-        if y is None:  # on all ranks
+        found = np.empty(len(b))
+        if self.inner is not None:
+            y = self.inner.solve(b[self.core], x[self.core], time_up)
+            if y is None:  # on all ranks
+                return None
+            found[self.core] = y
+        return found if self._substituted(b, found) else None
+
+    def solve_transposed(self, b: Floats, time_up: TimeUp, flat: float) -> Floats | None:
+        """Return x >= 0 with x = b + M'x; None where none is in sight. Collective."""
+        x = np.zeros(self.mesh.columns + 1)
+        x[: len(b)], good = b, True
+        for k, part in enumerate(self._parts):
+            if k:
+                self.crossing[k].add(x)
+            good &= bool(_down(part, self.system.kernel, x))
+        self.crossing[-1].add(x)
+        if not self.mesh.ranks.all(good):
             return None
-        found = np.full(len(b), np.nan)
-        found[self.core] = y
-        return found if _substituted(self.whole, self.order[::-1].copy(), b, found) else None
+        if self.inner is not None:
+            y = self.inner.solve_transposed(x[: len(b)][self.core], time_up, flat)
+            if y is None:
+                return None
+            x[: len(b)][self.core] = y
+        return x[: len(b)].copy()
 
     def advance(self, b: Floats, x: Floats, count: int, flat: float) -> float:
         """Come closer to x = b + M x in place by sweeps of the core, exactly outside. Collective.
 
         Returns the largest relative change of the last sweep, infinite where none is in sight.
         """
-        y = x[self.core]
-        change = self.inner.sweep(b[self.core], y, count, 0.0, flat)[1]
-        if not change < np.inf:
-            return np.inf
-        x[:] = np.nan
-        x[self.core] = y
-        return change if _substituted(self.whole, self.order[::-1].copy(), b, x) else np.inf
+        change = 0.0
+        if self.inner is not None:
+            y = x[self.core]
+            change = self.inner.advance(b[self.core], y, count, flat)
+            if not change < np.inf:
+                return np.inf
+            x[self.core] = y
+        return change if self._substituted(b, x) else np.inf
 
-
-def _substituted(whole: SpreadSystem, order: NDArray[np.uint32], b: Floats, x: Floats) -> bool:
-    """Fill in the cells of an order, NaN where not known yet; False where one is infinite."""
-    mesh, ranks = whole.mesh, whole.ranks
-    values = np.full(mesh.columns + 1, np.nan)
-    values[: len(x)], values[mesh.columns] = x, 0.0
-    told: dict[int, Bools] = {}
-    while True:
-        mesh.tell(values, whole.halo, told)
-        left, finite = _fill(order, whole.system.kernel, b, values)
+    def _substituted(self, b: Floats, x: Floats) -> bool:
+        """Make the values outside the core from those in it; False where one is infinite."""
+        values, good = np.full(self.mesh.columns + 1, np.nan), True
+        values[: len(x)][self.core], values[-1] = x[self.core], 0.0
+        self.crossing[-1].fill(values)
+        for k, part in reversed([*enumerate(self._parts)]):
+            good &= bool(_back(part, self.system.kernel, b, values))
+            if k:
+                self.crossing[k].fill(values)
         x[:] = values[: len(x)]
-        every = ranks.collect((int(left), bool(finite)))
-        if not all(good for _, good in every):
-            return False
-        if not any(count for count, _ in every):
-            return True
+        return self.mesh.ranks.all(good)
 
 
-def transposed(peeled: SpreadPeeled, cells: Indices, shape: tuple[int, ...]) -> SpreadPeeled:
-    """Return M' with the same core; :func:`solve_transposed` solves it. Collective."""
-    whole = peeled.whole.transposed(cells, shape)
-    return replace(
-        peeled, whole=whole, inner=_among(whole, peeled.core, cells, shape, against=True)
-    )
-
-
-def solve_transposed(
-    turned: SpreadPeeled, b: Floats, time_up: TimeUp, flat: float
-) -> Floats | None:
-    """Return x >= 0 with x = b + M'x, None where none is in sight; ``turned`` is M'. Collective."""
-    x = np.full(len(b), np.nan)
-    if not _substituted(turned.whole, turned.order, b, x):
-        return None
-    outside = np.where(turned.core, 0.0, x)
-    known = turned.whole.mesh.spread(outside, 0.0, turned.whole.halo)
-    flow = np.zeros(len(b))
-    _times(turned.whole.system.kernel, known, flow)
-    start = b[turned.core] + flow[turned.core]
-    y = turned.inner.solve(start, start.copy(), time_up, flat)
-    if y is None:
-        return None
-    x[turned.core] = y
-    return x
-
-
-def of_chain(lp: StabilizationLP, policy: Indices, gamma: float) -> SpreadPeeled:
-    """Return gamma P_u for a policy of own columns, its core found; collective."""
-    assert lp.mesh is not None
-    whole = SpreadSystem.of(lp.mesh, of_policy(lp, policy, gamma), lp.cells, lp.partition.shape)
-    return SpreadPeeled.of(whole, lp.cells, lp.partition.shape)
-
-
-def _outside(whole: SpreadSystem) -> NDArray[np.uint32]:
-    """Return the own cells outside the core, each before all it leads to on this rank."""
-    mesh, system = whole.mesh, whole.system
-    own = mesh.own
-    ways = np.zeros(mesh.columns, dtype=np.int64)
+def _rounds(mesh: Mesh, system: SplitMatrix) -> tuple[CellNumbers, list[int], list[Halo]]:
+    """Return the order of the own cells outside the core, its rounds, and what crosses in each."""
+    own, columns = mesh.own, mesh.columns
+    ways = np.zeros(columns, dtype=np.uint32)
     _count(system.kernel, ways)
-    ways[:own] = _told(mesh, ways)
-    ways[own:] = 0
-    order, end = np.empty(own, dtype=np.uint32), 0
-    free = np.flatnonzero(ways[:own] == 0).astype(np.uint32)
-    order[: len(free)], start, end = free, 0, len(free)
+    halo = mesh.narrowed(ways > 0)
+    for cells in halo.send.values():
+        ways[cells] += np.uint32(1)  # one more for each rank whose cells lead to it
+    order, lost = np.empty(columns + int(BYTE), dtype=np.uint32), np.empty(columns - own, np.uint32)
+    marks = np.zeros(columns // int(WORD) + 1, dtype=np.uint64)
+    free = np.flatnonzero(ways[:own] == 0)
+    order[: len(free)], end, start = free, len(free), 0
+    ends: list[int] = []
     while True:
-        end = int(_cascade(order, start, end, system.kernel, ways))
-        before = ways[:own].copy()
-        ways[:own] = _told(mesh, ways)  # ghosts lost ways: their owners are told
-        ways[own:] = 0
-        news = np.flatnonzero((ways[:own] == 0) & (before > 0)).astype(np.uint32)
-        start = end
-        order[end : end + len(news)], end = news, end + len(news)
-        if not mesh.ranks.any(len(news) > 0):
-            return order[:end].copy()
+        end, gone = _cascade(order, start, end, system.kernel, ways, marks, lost)
+        ends.append(int(end))
+        came, more = mesh.ranks.exchange_news(_news(halo, np.sort(lost[:gone])))
+        if not more:
+            break
+        start = int(end)
+        free = _freed(halo, came, ways)
+        order[start : start + len(free)], end = free, start + len(free)
+    kind: Any = np.uint16 if len(ends) < 2**16 - 1 else np.uint32
+    of = np.full(columns, np.iinfo(kind).max, dtype=kind)
+    for k, (a, b) in enumerate(zip([0, *ends], ends, strict=False)):
+        of[order[a:b]] = k
+    halo.fill(of)
+    return order[: ends[-1]].copy(), ends, halo.parted(of, len(ends))
 
 
-def _told(mesh: Mesh, ways: Indices) -> Indices:
-    """Return the numbers of own cells with what other ranks have to add to them; collective."""
-    own, named = ways[: mesh.own].copy(), np.flatnonzero(ways[mesh.own :])
-    cells, more = mesh.ghosts[named], ways[mesh.own + named]
-    owner = mesh.division.owner(cells)
-    parcels = {
-        int(k): np.concatenate(
-            [(cells - mesh.division.starts[k])[owner == k], more[owner == k]],
-            dtype=np.int32,
-            casting="same_kind",
-        )
-        for k in np.unique(owner)
-    }
-    for other, came in mesh.ranks.exchange(parcels).items():
-        at, ways_there = np.split(came, 2)
-        if len(at) and not (at.min() >= 0 and at.max() < len(own)):
-            raise RankError(
-                f"rank {other} counts ways to cells that rank {mesh.ranks.rank} has not"
-            )
-        np.add.at(own, at, ways_there)
-    return own
+def _news(halo: Halo, lost: CellNumbers) -> dict[int, CellNumbers]:
+    """Return which ghosts their owners are told of, by their places in the plan."""
+    parcels = {}
+    for of, slots in halo.slots.items():
+        first, last = np.searchsorted(lost, [slots[0], slots[-1] + 1])
+        if first < last:
+            parcels[of] = np.searchsorted(slots, lost[first:last]).astype(np.uint32)
+    return parcels
 
 
-def _among(
-    whole: SpreadSystem, core: Bools, cells: Indices, shape: tuple[int, ...], against: bool = False
-) -> SpreadSystem:
-    """Return the system of some cells alone, numbered anew; what leads elsewhere is left out."""
-    mesh = whole.mesh
-    division = mesh.division.within(mesh.ranks, core)
-    number = np.full(mesh.own, -1, dtype=np.int64)
-    number[core] = division.own(mesh.ranks.rank)[0] + np.arange(int(core.sum()))
-    numbers = mesh.spread(number, -1, whole.halo)
-    begin, end, indices, data, inverse = whole.system.kernel
-    rows = np.flatnonzero(core)
-    length = (end - begin)[rows].astype(np.int64)
-    at = np.repeat(begin[rows].astype(np.int64) - np.append(0, np.cumsum(length))[:-1], length)
-    at += np.arange(len(at))
-    target = numbers[indices[at]]
-    row = np.repeat(np.arange(len(rows)), length)[target >= 0]
-    pointer = np.append(0, np.cumsum(np.bincount(row, minlength=len(rows)))).astype(np.uint64)
-    named = target[target >= 0]
-    inner = Mesh.of(mesh.ranks, division, named)
-    system = SplitMatrix(
-        pointer[:-1].copy(), pointer[1:].copy(), inner.local(named).astype(np.uint32),
-        data[at][target >= 0], inverse[rows], whole.system.directions.among(rows),
-    )  # fmt: skip
-    return SpreadSystem.of(inner, system, cells[core], shape, against)
+def _freed(halo: Halo, came: dict[int, NDArray[Any]], ways: NDArray[np.uint32]) -> Indices:
+    """Return the own cells to which none leads any more, now that others have told of theirs."""
+    free = []
+    for other, places in came.items():
+        known = halo.send.get(other, np.empty(0, dtype=np.int64))
+        if len(places) and not places.max() < len(known):
+            raise RankError(f"rank {other} tells of cells that rank {halo.ranks.rank} has not")
+        cells = known[places]
+        ways[cells] -= np.uint32(1)
+        free.append(cells[ways[cells] == 0])
+    return np.sort(np.concatenate([*free, np.empty(0, dtype=np.int64)]))
 
 
 @kernel
@@ -207,61 +202,56 @@ def _count(system, ways):  # type: ignore[no-untyped-def]
     begin, end, indices = system.begin, system.end, system.indices
     for i in range(np.uint64(len(begin))):
         for e in range(begin[i], end[i]):
-            ways[indices[e]] += 1
+            ways[indices[e]] += np.uint32(1)
 
 
 @kernel
-def _cascade(order, start, end, system, ways):  # type: ignore[no-untyped-def]
-    """Take away own cells, and those to which only they lead; return where ``order`` ends.
+def _cascade(order, at, count, system, ways, marks, lost):  # type: ignore[no-untyped-def]
+    """Take away own cells ``order[at:count]``, those to which only they lead, and so on.
 
-    Ghosts count down from 0.
+    As :func:`lmdsl.optimize.linear.substitution._peel` does, level by level, each ascending. The
+    ghosts to which no own cell leads any more are ``lost``. Returns where the order ends, and the
+    number of these.
     """
     begin, stop, indices = system.begin, system.end, system.indices
-    own = len(order)
-    while start < end:
-        i = order[start]
-        start += 1
-        for e in range(begin[i], stop[i]):
-            j = indices[e]
-            ways[j] -= 1
-            if ways[j] == 0 and j < own:
-                order[end] = j
-                end += 1
-    return end
-
-
-@kernel
-def _fill(order, system, b, x):  # type: ignore[no-untyped-def]
-    """Make the values of cells that lead to known ones only; NaN is not known.
-
-    Returns how many are left, and whether all that were made are finite.
-    """
-    begin, end, indices, data, inverse = system
-    left = 0
-    for t in range(np.uint64(len(order))):
-        i = order[t]
-        if x[i] == x[i]:
-            continue
-        y = b[i]
-        for e in range(begin[i], end[i]):
-            y += data[e] * x[indices[e]]
-        if y != y:
-            left += 1
-            continue
-        if y != 0.0:
-            y *= inverse[i]
-            if inverse[i] >= NEVER or not y < CEILING:
-                return left, False
-        x[i] = y
-    return left, True
-
-
-@kernel
-def _times(system, x, out):  # type: ignore[no-untyped-def]
-    """Write M x, without the diagonal of M."""
-    begin, end, indices, data = system.begin, system.end, system.indices, system.data
-    for i in range(np.uint64(len(begin))):
-        y = 0.0
-        for e in range(begin[i], end[i]):
-            y += data[e] * x[indices[e]]
-        out[i] = y
+    own, at, count, gone = np.uint64(len(begin)), np.uint64(at), np.uint64(count), np.uint64(0)
+    while at < count:
+        last = count
+        low, high = np.uint64(len(marks)), np.uint64(0)
+        for t in range(at, last):
+            i = order[t]
+            for e in range(begin[i], stop[i]):
+                j = np.uint64(indices[e])
+                left = ways[j] - np.uint32(1)
+                ways[j] = left
+                word = j // WORD
+                marks[word] |= np.uint64(left == 0) << (j % WORD)
+                low = word if word < low else low
+                high = word if word > high else high
+                order[count] = j
+                count += np.uint64(left == 0)
+        if low <= high and high - low > FAR * (count - last):  # few, far apart: as they came
+            for t in range(last, count):
+                marks[order[t] // WORD] = np.uint64(0)
+            low, high = np.uint64(1), np.uint64(0)
+        else:
+            count = last
+        for w in range(low, high + ONE):
+            bits, first = marks[w], np.uint64(w) * WORD
+            marks[w] = np.uint64(0)
+            while bits != np.uint64(0):
+                for d in range(BYTE):
+                    order[count] = first + d
+                    count += (bits >> d) & ONE
+                bits, first = bits >> BYTE, first + BYTE
+        kept = last
+        for t in range(last, count):
+            j = order[t]
+            if j < own:
+                order[kept] = j
+                kept += ONE
+            else:
+                lost[gone] = j
+                gone += ONE
+        at, count = last, kept
+    return count, gone

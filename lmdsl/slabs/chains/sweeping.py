@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Indices, TimeUp
 from lmdsl.machine.deadline import Stopped
+from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.directions import Directions
 from lmdsl.optimize.linear import extrapolation
 from lmdsl.optimize.linear.equations import (
@@ -65,7 +66,9 @@ class SpreadSystem:
             own = Directions(cells[a - first : b - first], shape).orders
             orders.append((a - first, b - first, own + np.uint32(a - first)))
         cycle = Directions(cells[:0], shape, against).cycle
-        return cls(mesh, mesh.for_rows(named(system)), system, orders, cycle)
+        used = np.zeros(mesh.columns, dtype=np.bool_)
+        _mark(system.kernel, used)
+        return cls(mesh, mesh.narrowed(used), system, orders, cycle)
 
     @property
     def ranks(self) -> Ranks:
@@ -212,11 +215,10 @@ class SpreadSystem:
         return SpreadSystem.of(turned, rows, cells, shape, against=True)
 
 
-def named(system: SplitMatrix) -> NDArray[np.int64]:
-    """Return the cells that rows name, by local numbers."""
-    begin, end = system.begin.astype(np.int64), system.end.astype(np.int64)
-    mark = np.zeros(len(system.indices) + 1, dtype=np.int64)
-    np.add.at(mark, begin, 1)
-    np.add.at(mark, end, -1)
-    used = np.cumsum(mark)[:-1] > 0
-    return np.unique(system.indices[used]).astype(np.int64)
+@kernel
+def _mark(system, used):  # type: ignore[no-untyped-def]
+    """Mark the cells that rows name."""
+    begin, end, indices = system.begin, system.end, system.indices
+    for i in range(np.uint64(len(begin))):
+        for e in range(begin[i], end[i]):
+            used[indices[e]] = True
