@@ -36,7 +36,7 @@ class Core(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class CoreRows:
     """The rows of the own cells of a core, its cells numbered over all ranks."""
 
     division: Division
@@ -80,7 +80,7 @@ class GatheredCore:
     share: int  # number of all cells for each of the core
 
     @classmethod
-    def of(cls, ranks: Ranks, rows: Rows, shape: tuple[int, ...], among: int) -> Self:
+    def of(cls, ranks: Ranks, rows: CoreRows, shape: tuple[int, ...], among: int) -> Self:
         """Gather the rows on rank 0; ``among`` is the number of all cells. Collective."""
         length = np.diff(rows.pointer).astype(np.uint32)
         whole = ranks.exchange({0: np.concatenate([length, rows.indices])})
@@ -91,7 +91,7 @@ class GatheredCore:
             return cls(ranks, division, None, share)
         own = np.diff(division.starts).tolist()
         lengths = np.concatenate([whole[k][:n] for k, n in enumerate(own)])
-        gathered = Rows(
+        gathered = CoreRows(
             division,
             np.append(0, np.cumsum(lengths, dtype=np.int64)).astype(np.uint64),
             np.concatenate([whole[k][n:] for k, n in enumerate(own)]),
@@ -167,11 +167,11 @@ class SweptCore:
     shape: tuple[int, ...]
 
     @classmethod
-    def of(cls, ranks: Ranks, rows: Rows, shape: tuple[int, ...]) -> Self:
+    def of(cls, ranks: Ranks, rows: CoreRows, shape: tuple[int, ...]) -> Self:
         """Return a core for sweeps; collective."""
         mesh = Mesh.of(ranks, rows.division, rows.indices)
         local = mesh.local(rows.indices).astype(np.uint32)
-        own = Rows(rows.division, rows.pointer, local, rows.data, rows.inverse, rows.cells)
+        own = CoreRows(rows.division, rows.pointer, local, rows.data, rows.inverse, rows.cells)
         system = SpreadSystem.of(mesh, own.system(rows.cells, shape), rows.cells, shape)
         return cls(system, rows.cells, shape)
 

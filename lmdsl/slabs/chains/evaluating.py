@@ -113,7 +113,7 @@ class ByFirst:
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownChain:
     """The chain of a policy; its rows may lie in the slots of a screen, until they change."""
 
     policy: Policy
@@ -132,7 +132,7 @@ class ByAll:
 
     lp: StabilizationLP
     time_up: TimeUp
-    last: dict[float, Known] = field(default_factory=dict)  # by gamma
+    last: dict[float, KnownChain] = field(default_factory=dict)  # by gamma
 
     def chain(self, policy: Policy, gamma: float, screen: Screen | None = None) -> SpreadPeeled:
         """Return gamma P_u; the last one is kept."""
@@ -143,7 +143,7 @@ class ByAll:
         slots = screen.slots if screen is not None and screen.gamma == gamma else None
         rows = None if slots is None else slots.system(policy)
         chain = SpreadPeeled.of_chain(self.lp, policy, gamma, rows)
-        self.last[gamma] = Known(policy.copy(), chain, slots)
+        self.last[gamma] = KnownChain(policy.copy(), chain, slots)
         return chain
 
     @property

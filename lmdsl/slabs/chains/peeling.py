@@ -28,7 +28,7 @@ from lmdsl.optimize.linear.policy_system import of_policy
 from lmdsl.optimize.linear.substitution import BYTE, FAR, WORD, CellNumbers, _back, _down
 from lmdsl.ranks.mesh import Halo, Mesh
 from lmdsl.ranks.verbs import RankError
-from lmdsl.slabs.chains.core import Core, GatheredCore, Rows, SweptCore
+from lmdsl.slabs.chains.core import Core, CoreRows, GatheredCore, SweptCore
 
 MOST_CORE = 10**6  # cells of a core up to which rank 0 solves it
 
@@ -65,7 +65,7 @@ class SpreadPeeled:
         order, ends, crossing = _rounds(mesh, system)
         core = np.ones(mesh.own, dtype=np.bool_)
         core[order] = False
-        rows = Rows.of(mesh, system, core, crossing[-1], cells)
+        rows = CoreRows.of(mesh, system, core, crossing[-1], cells)
         inner: Core | None = None
         size = rows.division.cells
         if 0 < size <= MOST_CORE:
