@@ -103,6 +103,8 @@ class Options:
         The cost of that policy, shape (n,); None where unknown.
     progress
         Called with (stage, fraction done or -1).
+    keep
+        Called with a g-stabilizing policy and a V >= T_u V after every step, for checkpoints.
     """
 
     tolerance: float | None = None
@@ -113,6 +115,7 @@ class Options:
     proof: Floats | None = None
     value: Floats | None = None
     progress: Callable[[str, float], None] | None = None
+    keep: Callable[[Indices, Floats], None] | None = None
 
 
 @dataclass(frozen=True, eq=False)

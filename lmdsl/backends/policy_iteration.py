@@ -58,8 +58,9 @@ def solve(lp: StabilizationLP, options: Options) -> Solution:
     if value is None:
         return Solution(Stop.FAILED, "some cell costs more than 1e305; divide stage_cost")
     done = iteration.iterate(
-        lp, policy, value, time_up=time_up, limit=options.max_iterations, changes=changes
-    )
+        lp, policy, value, time_up=time_up, limit=options.max_iterations, changes=changes,
+        keep=options.keep,
+    )  # fmt: skip
     stop = Stop.OPTIMAL
     if not done.converged:
         stop = Stop.TIME_LIMIT if time_up() else Stop.ITERATION_LIMIT

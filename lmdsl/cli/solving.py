@@ -31,6 +31,8 @@ OPTIONS = (
     "restrict_to_gamma",
     "proved",
     "rows_on_disk",
+    "checkpoint",
+    "resume",
 )
 # Runs of the true map that follow a solve: how many, how long, and how long all together.
 STARTS, STEPS, SECONDS = 1_000, 10_000, 10.0
@@ -49,6 +51,10 @@ def add(command: Command) -> None:
                        help="solve on the cells for which gamma is feasible")  # fmt: skip
     solve.add_argument("--proved", type=float, metavar="T",
                        help="repair until this share of cells is proved to arrive")  # fmt: skip
+    solve.add_argument("--checkpoint", metavar="DIR",
+                       help="keep the policy at hand in DIR every minute")  # fmt: skip
+    solve.add_argument("--resume", metavar="DIR",
+                       help="begin with the policy that was kept in DIR")  # fmt: skip
     solve.add_argument("--rows-on-disk", metavar="DIR",
                        help="keep the rows in files of DIR instead of memory")  # fmt: skip
     solve.add_argument("--out", metavar="DIR", help="write controller and certificate to DIR")

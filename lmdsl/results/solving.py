@@ -2,24 +2,28 @@
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl import backends
-from lmdsl.backends import Backend, Options, Solution, Stop
+from lmdsl.backends import Backend, Options, Solution, Stop, policy_iteration
 from lmdsl.backends.asking import ask
 from lmdsl.certificate import judge
 from lmdsl.certificate.claims import Verified, Witness
 from lmdsl.common import inputs
 from lmdsl.common.on_disk import WHERE
-from lmdsl.common.types import FilePath, Progress, told
+from lmdsl.common.types import FilePath, Floats, Indices, Progress, told
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.lp import StabilizationLP, compile
+from lmdsl.optimize import checkpoints
 from lmdsl.optimize.feasibility import first_policy, gamma_bar, lifting, restriction
 from lmdsl.optimize.witness import certify
 from lmdsl.problem import Problem, given
@@ -44,6 +48,8 @@ def solve(
     proved: float | None = None,
     start: Result | None = None,
     rows_on_disk: FilePath | None = None,
+    checkpoint: FilePath | None = None,
+    resume: FilePath | None = None,
     progress: Progress | bool | None = None,
 ) -> Result:
     """Solve a problem and verify the answer.
@@ -76,6 +82,11 @@ def solve(
         another gamma, say: the search begins at its controller. The answer is the same.
     rows_on_disk
         A folder: the rows lie there, in files that vanish with the result, instead of in memory.
+    checkpoint
+        A folder: policy and V are kept there every minute or so, and the last ones.
+    resume
+        A folder with a checkpoint of the same problem: the search begins at its policy, which is
+        proved anew. The answer is the same. One that is ``checkpoint`` may still be empty.
     progress
         Called with (stage, fraction done, or -1); True shows it on stderr, with the time left.
 
@@ -94,11 +105,13 @@ def solve(
     problem = given(problem, StabilizationLP)
     _check_options(tolerance, max_iterations)
     _not_compiled_yet(problem, rows_on_disk)
+    declared = problem if isinstance(problem, Problem) else problem.problem
     require_all = inputs.flag(require_all, "require_all")
     restrict_to_gamma = inputs.flag(restrict_to_gamma, "restrict_to_gamma")
     if restrict_to_gamma:
-        _no_enclosures(problem if isinstance(problem, Problem) else problem.problem)
+        _no_enclosures(declared)
     chosen, algorithm = backends.resolve(backend)
+    _keeps(chosen, checkpoint)
     request = _Request(
         backend=chosen,
         algorithm=algorithm,
@@ -110,13 +123,14 @@ def solve(
         restrict_to_gamma=restrict_to_gamma,
         start=_earlier(start),
         rows_on_disk=rows_on_disk,
+        resume=checkpoints.wanted(resume, declared, checkpoint, start),
+        keeping=checkpoints.Checkpoints.of(checkpoint, declared),
         progress=progress,
     )
     if proved is None:
         return _solved(problem, request)
     from lmdsl.results.directory.repair import repairing
 
-    declared = problem if isinstance(problem, Problem) else problem.problem
     repairing.require_provable(proved, declared, restrict_to_gamma)
     first = _solved(problem, request)
 
@@ -156,14 +170,24 @@ class _Request:
     restrict_to_gamma: bool
     start: lifting.Earlier | None
     rows_on_disk: FilePath | None
+    resume: Path | None
+    keeping: checkpoints.Checkpoints | None
     progress: Progress | None
 
     def first(
         self, lp: StabilizationLP
     ) -> first_policy.Feasible | first_policy.Refused | first_policy.Undecided:
-        """Return the policy to begin with: of an earlier controller, where that serves."""
-        found = None if self.start is None else lifting.lifted(lp, self.start, self.deadline)
+        """Return the policy to begin with: an earlier one, where that serves."""
+        found, kept = None, checkpoints.unfinished(self.resume, lp)
+        if kept is not None:
+            found = lifting.continued(lp, kept, self.deadline)
+        elif self.start is not None:
+            found = lifting.lifted(lp, self.start, self.deadline)
         return found or first_policy.stabilizing(lp, self.deadline)
+
+    def keep(self, lp: StabilizationLP) -> Callable[[Indices, Floats], None] | None:
+        """Return what keeps a policy of a model on the way, None where nothing does."""
+        return None if self.keeping is None else partial(self.keeping.keep, lp)
 
     def tell(self, stage: str) -> None:
         """Tell the caller what begins."""
@@ -190,6 +214,8 @@ def _answer(lp: StabilizationLP, request: _Request, compile_seconds: float | Non
             return infeasible
         first = first_policy.Undecided(first.best.policy, first.lower)
     solution, outcome = _asked(lp, first, request, job)
+    if request.keeping and outcome.value is not None:
+        request.keeping.keep(lp, outcome.policy, outcome.value, last=True)
     job.solve_seconds = time.perf_counter() - started
     request.tell("verify")
     started = time.perf_counter()
@@ -240,6 +266,7 @@ def _asked(
             proof=first.w,
             value=first.value,
             progress=request.progress,
+            keep=request.keep(lp),
         )
         solution, iteration, job.log = ask(lp, request.backend, options)
     outcome = _polish(lp, solution, iteration, first.policy, request.tolerance, deadline)
@@ -256,6 +283,11 @@ def _check_options(tolerance: Any, max_iterations: Any) -> None:
 def _not_compiled_yet(problem: Problem | StabilizationLP, rows_on_disk: Any) -> None:
     if rows_on_disk is not None and isinstance(problem, StabilizationLP):
         raise BadInput("the problem is compiled already; give it to lm.compile", WHERE)
+
+
+def _keeps(backend: Backend, checkpoint: Any) -> None:
+    if checkpoint is not None and backend.solve is not policy_iteration.solve:
+        raise BadInput(f"{backend.name} keeps none; use policy-iteration", "checkpoint")
 
 
 def _earlier(start: Any) -> lifting.Earlier | None:

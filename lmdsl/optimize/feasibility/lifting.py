@@ -16,10 +16,12 @@ from lmdsl.common.types import Floats, Indices, Policy, TimeUp, never
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Stopped
+from lmdsl.machine.kernels import kernel
 from lmdsl.model.algorithm_1 import reaches_attractor
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.optimize.feasibility.first_policy import Feasible
+from lmdsl.optimize.checkpoints import Unfinished
+from lmdsl.optimize.feasibility.first_policy import Feasible, _proved
 from lmdsl.optimize.policies import evaluation
 
 COLUMN = 24  # bytes of a column while controls are looked up
@@ -64,18 +66,57 @@ def lifted(lp: StabilizationLP, earlier: Earlier, time_up: TimeUp = never) -> Fe
     """Return the lifted policy with its proof and its value; None where it is not stabilizing."""
     if not memory.fits(COLUMN * lp.K):
         return None
-    policy = _column(lp, earlier)
+    return _proved_anew(lp, _column(lp, earlier), None, time_up)
+
+
+def continued(lp: StabilizationLP, kept: Unfinished, time_up: TimeUp = never) -> Feasible | None:
+    """Return the policy of a checkpoint with its proof and value; None where it is no good."""
+    guess = kept.value[lp.cells]
+    good = bool((np.isfinite(guess) & (guess > 0)).all())
+    return _proved_anew(
+        lp, columns_of(lp, kept.control[lp.cells]), guess if good else None, time_up
+    )
+
+
+def _proved_anew(
+    lp: StabilizationLP, policy: Policy, guess: Floats | None, time_up: TimeUp
+) -> Feasible | None:
+    """Return a policy, where it serves, with its proof and value; None where it does not."""
     below = lp._algorithm_1[1]
     policy = np.where(policy >= 0, policy, below)
     policy = np.where(reaches_attractor(lp, policy), policy, below)
     try:
-        w, _ = evaluation.stability_vector(lp, policy, time_up=time_up)
+        w = None if guess is None else _proved(lp, policy, guess, time_up)
+        if w is None:
+            w, _ = evaluation.stability_vector(lp, policy, time_up=time_up)
         if w is None:
             return None
-        value = evaluation.evaluate(lp, policy, transient=True, time_up=time_up)
+        value = evaluation.evaluate(lp, policy, start=guess, transient=True, time_up=time_up)
     except Stopped:
         return None
     return None if value is None else Feasible(policy, w, value)
+
+
+def columns_of(lp: StabilizationLP, control: NDArray[np.integer]) -> Policy:
+    """Return the column of a control of each cell of C, shape (n,); -1 where it has none."""
+    column = np.empty(lp.n, dtype=np.int64)
+    _find(lp.pair_pointer, lp.control, np.ascontiguousarray(control, dtype=np.int64), column)
+    return column
+
+
+@kernel
+def _find(pair_pointer, control, wanted, column):  # type: ignore[no-untyped-def]
+    """Look for a control among those of each cell, which ascend."""
+    for i in range(len(column)):
+        low, high = pair_pointer[i], pair_pointer[i + 1]
+        while low < high:
+            middle = (low + high) // 2
+            if control[middle] < wanted[i]:
+                low = middle + 1
+            else:
+                high = middle
+        found = low < pair_pointer[i + 1] and control[low] == wanted[i]
+        column[i] = low if found else -1
 
 
 def _column(lp: StabilizationLP, earlier: Earlier) -> Policy:

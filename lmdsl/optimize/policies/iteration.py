@@ -59,6 +59,7 @@ def iterate(
     time_up: TimeUp = never,
     limit: int | None = None,
     changes: Callable[[int], None] | None = None,
+    keep: Callable[[Policy, Floats], None] | None = None,
 ) -> Iteration:
     """Policy iteration from a gamma-stabilizing policy until no control is better.
 
@@ -74,6 +75,8 @@ def iterate(
         Asked before every step; largest number of steps.
     changes
         Told after every step how many controls it changed.
+    keep
+        Told after every step the policy and V >= T_u V.
 
     Notes
     -----
@@ -120,6 +123,8 @@ def iterate(
                 return ended(last is not None and not out)
             screen.follow(V, np.minimum(exact, V))
             V = exact
+        if keep:
+            keep(policy, V)
         if exact is not None:
             if last is not None and not (exact < last[1]).any():
                 return ended(not out)  # rounding made a change look better than it is
