@@ -8,11 +8,13 @@ gamma_bar does, is found by rank 0 with the code of one process, where the model
 import time
 from typing import NamedTuple
 
-from lmdsl.common.types import Progress
+from lmdsl.common.on_disk import Disk
+from lmdsl.common.types import FilePath, Progress
 from lmdsl.distributed.answer import Answer
 from lmdsl.distributed.making import AnswerMaker
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize import checkpoints
 from lmdsl.problem.problem import Problem
 from lmdsl.ranks.verbs import Ranks
 from lmdsl.results import solving as alone
@@ -32,6 +34,8 @@ class Wanted(NamedTuple):
         As of ``solve``.
     gathered
         Number of cells up to which rank 0 evaluates policies, else all ranks do.
+    rows_on_disk, checkpoint, resume
+        As of ``solve``: folders, of which the last two are the same on every rank.
     whole
         Number of transitions up to which rank 0 holds the whole model, where that is needed.
     """
@@ -42,6 +46,9 @@ class Wanted(NamedTuple):
     restrict_to_gamma: bool = False
     gathered: int = MOST_GATHERED
     whole: int = whole.MOST_WHOLE
+    rows_on_disk: FilePath | None = None
+    checkpoint: FilePath | None = None
+    resume: FilePath | None = None
 
 
 def answer(
@@ -60,16 +67,29 @@ def answer(
     wanted = wanted or Wanted()
     deadline, started = Deadline.of(wanted.time_limit), time.perf_counter()
     maker = AnswerMaker(ranks, problem, wanted.tolerance, deadline)
+    kept, keeping, disk = ranks.agreed(
+        lambda: (
+            checkpoints.wanted(wanted.resume, problem, wanted.checkpoint),
+            checkpoints.Checkpoints.of(wanted.checkpoint, problem),
+            Disk.of(wanted.rows_on_disk),
+        )
+    )
+    ranks.alike(kept is None, "folders of checkpoints")
     try:
-        lp = compiling.compiled(ranks, problem, deadline)
+        lp = compiling.compiled(ranks, problem, deadline, disk)
     except TimeLimitReached as error:
         return maker.not_compiled(str(error), time.perf_counter() - started)
     maker.compile_seconds = time.perf_counter() - started
-    return _answered(maker, lp, wanted, progress)
+    return _answered(maker, lp, wanted, progress, checkpoints.unfinished(kept, lp), keeping)
 
 
 def _answered(
-    maker: AnswerMaker, lp: StabilizationLP, wanted: Wanted, progress: Progress | None
+    maker: AnswerMaker,
+    lp: StabilizationLP,
+    wanted: Wanted,
+    progress: Progress | None,
+    kept: checkpoints.Unfinished | None,
+    keeping: checkpoints.Checkpoints | None,
 ) -> Answer:
     """Answer a compiled problem."""
     ranks, deadline = maker.ranks, maker.deadline
@@ -84,7 +104,7 @@ def _answered(
     if progress:
         progress("solve", -1.0)
     started = time.perf_counter()
-    found = solving.solved(lp, wanted.tolerance, deadline, wanted.gathered)
+    found = solving.solved(lp, wanted.tolerance, deadline, wanted.gathered, kept, keeping)
     maker.solve_seconds = time.perf_counter() - started
     late = ranks.any(deadline())
     if found is not None and found.certificate.verified:

@@ -44,10 +44,15 @@ log = logging.getLogger(__name__)
 
 
 class Unfinished(NamedTuple):
-    """A policy to begin with, and a guess of its V, of consecutive cells of the box."""
+    """A policy to begin with, and a guess of its V, on the own cells of C, shape (n,) each."""
 
-    control: NDArray[np.int32]  # control index, -1 where there is none
+    control: NDArray[np.int32]  # control index, whatever was read
     value: Floats
+
+    @property
+    def positive(self) -> bool:
+        """Whether V is what it may be: finite, and no free of cost."""
+        return bool((np.isfinite(self.value) & (self.value > 0)).all())
 
 
 class Checkpoints:
@@ -195,7 +200,7 @@ def wanted(path: Any, problem: Problem, checkpoint: Any, start: Any = None) -> P
 
 
 def unfinished(folder: Path | None, lp: StabilizationLP) -> Unfinished | None:
-    """Return what a checkpoint holds for the own cells of a model; None where there is none.
+    """Return what a checkpoint holds for the own cells of C; None where there is none.
 
     Collective. BadInput: it is not whole, or of other cells.
     """
@@ -205,7 +210,9 @@ def unfinished(folder: Path | None, lp: StabilizationLP) -> Unfinished | None:
     sizes = ranks.collect(len(lp.cell_status))
     first = sum(sizes[: ranks.rank])
     own = slice(first, first + sizes[ranks.rank])
-    return ranks.agreed(lambda: _read(folder, sum(sizes), len(lp.controls), own))
+    found = ranks.agreed(lambda: _read(folder, sum(sizes), len(lp.controls), own))
+    mine = lp.cells - first
+    return Unfinished(found.control[mine], found.value[mine])
 
 
 def _read(folder: Path, N: int, M: int, own: slice) -> Unfinished:

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 
 from lmdsl.common.types import Floats, Policy, TimeUp
+from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.optimize.feasibility import first_policy
+from lmdsl.optimize.checkpoints import Unfinished
+from lmdsl.optimize.feasibility import first_policy, lifting
 from lmdsl.optimize.policies import bellman
 from lmdsl.slabs.chains.evaluating import Evaluator, evaluator
 from lmdsl.slabs.chains.first import First
@@ -14,6 +16,21 @@ from lmdsl.slabs.iterating import iterated
 
 ROUNDS = 50  # times that gamma is raised
 NEAREST = 1e-9  # relative distance up to which it is raised towards the gamma asked for
+
+
+def continued(first: First, by: Evaluator, kept: Unfinished | None) -> tuple[Policy, Floats] | None:
+    """Return the policy of a checkpoint and its value, once it is proved; None where it is not."""
+    if kept is None:
+        return None
+    column = lifting.columns_of(first.lp, kept.control)
+    policy = np.where(column >= 0, column, first.lp._algorithm_1[1])
+    found = by.bound(policy, kept.value if first.mesh.ranks.all(kept.positive) else None)
+    if found is None:
+        return None
+    try:
+        return policy, by.value(policy, found)
+    except Stopped:  # on all ranks
+        return policy, found
 
 
 def soon(first: First, by: Evaluator) -> tuple[Policy, Floats] | None:

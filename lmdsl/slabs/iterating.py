@@ -3,6 +3,8 @@
 While a policy is improved its values never rise: where they do, ranks saw wrong values.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
 from lmdsl.common.types import Floats, Policy, TimeUp
@@ -13,16 +15,18 @@ from lmdsl.ranks.verbs import RankError
 from lmdsl.slabs.chains.evaluating import Evaluator
 from lmdsl.slabs.chains.first import First
 
+Keep = Callable[[Policy, Floats], None]
 RISE, TINY = 1e-9, 1e-300  # relative rise of a value up to which it is rounding
 
 
 def iterated(
-    first: First, by: Evaluator, policy: Policy, V: Floats, time_up: TimeUp
-) -> tuple[Policy, Floats, Screen, int]:
+    first: First, by: Evaluator, policy: Policy, V: Floats, time_up: TimeUp,
+    keep: Keep | None = None,
+) -> tuple[Policy, Floats, Screen, int]:  # fmt: skip
     """Improve a policy until no control is better; return the last, its value, and the steps.
 
     As :func:`lmdsl.optimize.policies.iteration.iterate`: while policies change a lower V >= T_u V
-    will do; only one evaluated to the end is returned.
+    will do; only one evaluated to the end is returned. ``keep`` is told every policy and its V.
     """
     lp, ranks = first.lp, first.mesh.ranks
     screen, steps, unevaluated = Screen(lp), 0, False
@@ -53,6 +57,8 @@ def iterated(
         ratio = min(ranks.collect(_least_ratio(V, np.minimum(lower, V))))
         screen.follow(np.ones(1), np.array([ratio]))
         policy, V = done.policy, lower
+        if keep:
+            keep(policy, V)
 
 
 def _require_fallen(first: First, before: Floats, after: Floats) -> None:

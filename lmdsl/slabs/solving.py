@@ -6,12 +6,14 @@ the last policy is the same, as ties are broken by rule.
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.common.types import Floats, Policy, TimeUp, never
 from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.checkpoints import Checkpoints, Unfinished
 from lmdsl.optimize.policies import ties
 from lmdsl.optimize.policies.iteration import TIE
 from lmdsl.optimize.policies.screening import Screen
@@ -33,20 +35,22 @@ class Solved:
 
 def solved(
     lp: StabilizationLP, tolerance: float = 1e-6, time_up: TimeUp = never,
-    gathered: int = MOST_GATHERED,
+    gathered: int = MOST_GATHERED, kept: Unfinished | None = None,
+    keeping: Checkpoints | None = None,
 ) -> Solved | None:  # fmt: skip
     """Solve a model that is spread over ranks; None where it is not decided. Collective.
 
     Where no first policy is found it is tried to prove that there is none.
 
     Policies of up to ``gathered`` cells are evaluated by rank 0, others by all ranks.
+    The search begins at a policy that was ``kept``, where that serves; ``keeping`` keeps it.
     """
     first = First(lp)
     if not first.mesh.division.cells:
         return None
     time_up = first.mesh.ranks.time_up(time_up)
     by = evaluator(lp, gathered, time_up)
-    begun = beginning.soon(first, by)
+    begun = beginning.continued(first, by, kept) or beginning.soon(first, by)
     if begun is None:
         w = refusing.refusal(lp, time_up)
         if w is not None:
@@ -55,8 +59,11 @@ def solved(
         begun = beginning.raised(lp, by, gathered, time_up)
     if begun is None:
         return None
-    policy, V, screen, steps = iterated(first, by, *begun, time_up)
+    keep = None if keeping is None else partial(keeping.keep, lp)
+    policy, V, screen, steps = iterated(first, by, *begun, time_up, keep)
     policy, value = _ties_broken(first, by, policy, V, screen, tolerance)
+    if keep is not None:
+        keep(policy, value, last=True)
     witness = by.witness(policy, value, tolerance)
     certificate = judging.verdict(lp, witness, tolerance)
     if certificate.gap is None or certificate.gap > tolerance:  # the same on every rank

@@ -71,11 +71,8 @@ def lifted(lp: StabilizationLP, earlier: Earlier, time_up: TimeUp = never) -> Fe
 
 def continued(lp: StabilizationLP, kept: Unfinished, time_up: TimeUp = never) -> Feasible | None:
     """Return the policy of a checkpoint with its proof and value; None where it is no good."""
-    guess = kept.value[lp.cells]
-    good = bool((np.isfinite(guess) & (guess > 0)).all())
-    return _proved_anew(
-        lp, columns_of(lp, kept.control[lp.cells]), guess if good else None, time_up
-    )
+    guess = kept.value if kept.positive else None
+    return _proved_anew(lp, columns_of(lp, kept.control), guess, time_up)
 
 
 def _proved_anew(
