@@ -12,9 +12,12 @@ import pytest
 
 LAUNCHER = shutil.which("mpiexec", path=str(Path(sys.executable).parent)) or shutil.which("mpiexec")
 
-needs_mpi = pytest.mark.skipif(
-    LAUNCHER is None or importlib.util.find_spec("mpi4py") is None, reason="needs mpi4py and an MPI"
-)
+absent = LAUNCHER is None or importlib.util.find_spec("mpi4py") is None
+
+
+def needs_mpi(test):
+    """Mark a test that starts processes of MPI."""
+    return pytest.mark.mpi(pytest.mark.skipif(absent, reason="needs mpi4py and an MPI")(test))
 
 
 def launch(count, program, *arguments, script="rank_programs.py"):
