@@ -89,6 +89,20 @@ def test_shipped_systems_are_solved_as_in_one_process(name):
             require_equal(one, every[0])
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(("count", "gathered", "most"), [(2, 0, 0), (2, 0, 10**6), (3, 10**6, 0)])
+def test_cart_and_pole_in_four_dimensions_are_solved_as_in_one_process(
+    count, gathered, most, monkeypatch
+):
+    """Few cells along the rail, along which ranks divide them: halos are large."""
+    monkeypatch.setattr(peeling, "MOST_CORE", most)
+    data = lm.systems.NAMED["cart_pole"].problem
+    box = {**data["state_box"], "x": {**data["state_box"]["x"], "cells": 8}}
+    problem = lm.Problem.model_validate({**data, "state_box": box})
+    every = as_threads(count, lambda ranks: answer(ranks, problem, gathered))
+    require_equal(lm.solve(problem), every[0])
+
+
 @pytest.mark.parametrize("most", [10**6, 0])
 @pytest.mark.parametrize("seed", [*SEEDS, None])
 def test_no_rank_has_to_hold_a_policy(seed, most, monkeypatch):
