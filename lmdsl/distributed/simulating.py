@@ -81,7 +81,7 @@ def simulated(
     rng.bit_generator.state = state
     deadline = Deadline.of(time_limit)
     loop = ranks.agreed(lambda: DividedLoop(ranks, law, deadline))
-    return simulate(loop, x.copy(), steps, rng, hold, Together(ranks, deadline))
+    return simulate(loop, x.copy(), steps, rng, hold, AskedTogether(ranks, deadline))
 
 
 def _starts(law: Controlled, count: int, rng: np.random.Generator) -> Floats:
@@ -92,7 +92,7 @@ def _starts(law: Controlled, count: int, rng: np.random.Generator) -> Floats:
     return draw_starts(law.partition, cells, weight, count, rng)
 
 
-class Together(Deadline):
+class AskedTogether(Deadline):
     """A deadline that all ranks ask together; it raises nothing, as ranks do not all look then."""
 
     def __init__(self, ranks: Ranks, deadline: Deadline) -> None:
