@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from lmdsl import cli
-from lmdsl.cli.output import Arguments, ProgressLine, narrated, print_json
+from lmdsl.cli.output import Arguments, ProgressLine, answer, narrated, print_json
 from lmdsl.cli.solving import problem_asked, simulated, summary
 from lmdsl.cli.streams import kept, muted, say
 from lmdsl.errors import BadInput, MissingDependency, printable
@@ -74,7 +74,7 @@ def _command(parsed: Arguments) -> Callable[[Ranks, Arguments], int]:
     """Return what runs a command over ranks."""
     if parsed.command in BY_FIRST:
         return _by_first
-    known: dict[str, Callable[[Ranks, Arguments], int]] = {"solve": _solve}
+    known: dict[str, Callable[[Ranks, Arguments], int]] = {"solve": _solve, "verify": _verify}
     return known.get(parsed.command, _refuse)
 
 
@@ -102,24 +102,36 @@ def _solve(ranks: Ranks, parsed: Arguments) -> int:
     options = parsed.tolerance, parsed.time_limit, parsed.require_all, parsed.restrict_to_gamma
     wanted = ranks.agreed(lambda: solving.asked(problem, *options))
     with ProgressLine() as progress:
-        answer = solving.solved(ranks, problem, wanted, progress if ranks.rank == 0 else None)
+        found = solving.solved(ranks, problem, wanted, progress if ranks.rank == 0 else None)
     if not parsed.json:  # reported first: whatever saving meets, the answer was given
-        say(summary(answer))
-    status, result = int(answer.exit_status), answer
+        say(summary(found))
+    status, result = int(found.exit_status), found
     try:
-        if parsed.out is not None and answer.model_sha256:  # else no time to compile
-            saving.save(ranks, answer, parsed.out)
+        if parsed.out is not None and found.model_sha256:  # else no time to compile
+            saving.save(ranks, found, parsed.out)
             if not parsed.json:
                 say(f"written to {printable(parsed.out)}")
-        if parsed.simulate and answer.model_sha256:
-            result = simulated_by_first(ranks, answer)
+        if parsed.simulate and found.model_sha256:
+            result = simulated_by_first(ranks, found)
     finally:
         if parsed.json:
             print_json(result.to_dict())
     if result.simulation and not parsed.json:
-        word = "verified" if answer.verified else "not verified"
+        word = "verified" if found.verified else "not verified"
         say(f"{word} on the finite model; {result.simulation.sentence()}")
     return status
+
+
+def _verify(ranks: Ranks, parsed: Arguments) -> int:
+    from lmdsl.distributed.verifying import verify
+
+    with ProgressLine() as progress:
+        found = verify(
+            parsed.dir, exact=parsed.exact, progress=progress, time_limit=parsed.time_limit,
+            ranks=ranks,
+        )  # fmt: skip
+    answer(parsed, found)
+    return 0 if found.holds else 1
 
 
 def simulated_by_first(ranks: Ranks, answer: Any) -> Any:

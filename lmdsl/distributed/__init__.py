@@ -2,5 +2,6 @@
 
 from lmdsl.distributed.answer import Answer as Answer
 from lmdsl.distributed.solving import solve as solve
+from lmdsl.distributed.verifying import verify as verify
 
-__all__ = ["Answer", "solve"]
+__all__ = ["Answer", "solve", "verify"]

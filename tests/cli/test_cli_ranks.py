@@ -81,7 +81,10 @@ def test_solve_says_what_one_process_says(tmp_path, file, capsys):
     expected = numbers_out(out).replace(str(tmp_path / "one"), str(tmp_path / "two"))
     assert numbers_out(done.stdout) == expected
     assert lm.verify(tmp_path / "two").holds
-    assert run(capsys, "verify", tmp_path / "two")[0] == 0
+    status, out, _ = run(capsys, "verify", tmp_path / "two")
+    done = over(2, "verify", tmp_path / "two")
+    assert (done.returncode, done.stderr) == (status, "")
+    assert numbers_out(done.stdout) == numbers_out(out)
 
 
 @needs_mpi

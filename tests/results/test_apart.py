@@ -1,37 +1,18 @@
 """Directories whose vectors are files of their own, as ranks write them: the same, but mapped."""
 
-import json
 import os
 import shutil
 
 import numpy as np
 import pytest
 from problems import made, standard_map
-from saved_results import names, posix, refused
+from saved_results import content, names, posix, put_apart, refused
 
 import lmdsl as lm
 from lmdsl.cli import main
-from lmdsl.common import arrays
 from lmdsl.results.directory import reading, vectors, writing
 
 OURS = {"certificate.json", "problem.json", *(f"{name}.npy" for name in vectors.TYPES)}
-
-
-def content(array, kind):
-    return arrays.header(array.shape, kind) + array.tobytes()
-
-
-def put_apart(source, target, **changed):
-    """Write a saved result anew, every vector in its own file."""
-    result, about = lm.Result.load(source), json.loads((source / "certificate.json").read_text())
-    begun, there = writing.Begun(target), {}
-    for name, kind in vectors.TYPES.items():
-        file = f"{name}.npy"
-        held = changed.get(name, content(getattr(result, name), kind))
-        begun.path(file).write_bytes(held)
-        there[file] = reading.digest_of(file, held)
-    files = {"problem.json": (source / "problem.json").read_bytes()}
-    begun.finish(files, there, lambda keys: reading.text({**about, **keys}))
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +46,7 @@ def test_it_is_the_same_result(saved, target, tmp_path):
     assert again.read_bytes() == (saved / "solution.npz").read_bytes()
 
 
+@pytest.mark.long
 def test_commands_read_it(target, tmp_path, capsys):
     for command in (["verify"], ["simulate", "--starts", "50"], ["plot"], ["explain"],
                     ["export", "--format", "csv", "--out", str(tmp_path / "x.csv")]):  # fmt: skip

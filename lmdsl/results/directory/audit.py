@@ -1,6 +1,7 @@
 """What a certificate.json says, compared with what was found anew: every number that is a claim."""
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -42,15 +43,24 @@ def differences(
 
     ``whole`` is the recompiled model, ``lp`` the part of it that a restricted result speaks of.
     """
-    reasons = [*_counts(lp, result), *_numbers(result, found), *_outside(lp, result)]
+    reasons = [*counts(_counted(lp), result), *numbers(result, found), *outside(lp, result)]
     sure = whole.sure_levels
     if sure is not None and not np.array_equal(np.asarray(result.sure_levels), sure):
         reasons.append("sure_levels differ from the recompiled model")
-    claims = certificate.claims
+    reasons += facts(result, certificate, found, mass(lp, result))
+    reasons += data_differences(lp, result)
+    return reasons + _bracket(whole, result, found)
+
+
+def facts(
+    result: Result, certificate: CertificateFile, found: Certificate, mass: float
+) -> list[str]:
+    """Return where a certificate says something else of what needs no model; ``mass`` is of mu."""
+    reasons, claims = list[str](), certificate.claims
     for name in (*(claim.name for claim in CLAIMS), "safe"):
         if claims.get(name) is not getattr(found, name):
             reasons.append(_differs(f"claims.{name}", claims.get(name), getattr(found, name)))
-    reasons += _residual(lp, result, certificate.measure_residual, found)
+    reasons += _residual(mass, certificate.measure_residual, found)
     if result.status == Status.VERIFIED and certificate.reasons:
         reasons.append("reasons are stored, but the status is verified")
     if result.status != Status.NOT_STABILIZABLE and result.cause is not None:
@@ -62,8 +72,7 @@ def differences(
         reasons += _reward(certificate.reward, result.reward)
     if certificate.scope != scope(result.problem):
         reasons.append("scope is not what verified speaks of")
-    reasons += data_differences(lp, result)
-    return reasons + _bracket(whole, result, found)
+    return reasons
 
 
 def _reward(stored: float | None, found: float | None) -> list[str]:
@@ -79,8 +88,8 @@ def _differs(name: str, stored: Any, found: Any) -> str:
     return f"{name} is stored as {stored!r}, but is {found!r}"
 
 
-def _counts(lp: StabilizationLP, result: Result) -> list[str]:
-    counts = {
+def _counted(lp: StabilizationLP) -> dict[str, float]:
+    return {
         "gamma": lp.gamma,
         "cells": lp.partition.size,
         "controls": len(lp.controls),
@@ -88,14 +97,18 @@ def _counts(lp: StabilizationLP, result: Result) -> list[str]:
         "attractor_cells": int((lp.cell_status == CellStatus.ATTRACTOR).sum()),
         "stabilizable_cells": lp.n,
     }
+
+
+def counts(known: Mapping[str, float], result: Result) -> list[str]:
+    """Return where a certificate counts otherwise than a model does."""
     return [
         _differs(name, getattr(result, name), count)
-        for name, count in counts.items()
+        for name, count in known.items()
         if getattr(result, name) != count
     ]
 
 
-def _numbers(result: Result, found: Certificate) -> list[str]:
+def numbers(result: Result, found: Certificate) -> list[str]:
     """Compare the four numbers: none may say more than is proved, nor much less."""
     now = {
         "cost": found.cost,
@@ -121,13 +134,16 @@ def _numbers(result: Result, found: Certificate) -> list[str]:
     return reasons
 
 
-def _residual(
-    lp: StabilizationLP, result: Result, stored: float | None, found: Certificate
-) -> list[str]:
+def mass(lp: StabilizationLP, result: Result) -> float:
+    """Return the sum of mu on the cells of a model, about."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(result.measure[lp.cells].sum())
+
+
+def _residual(mass: float, stored: float | None, found: Certificate) -> list[str]:
     true = found.measure_residual
     if stored is not None and true is not None and np.isfinite(true):
-        with np.errstate(over="ignore", invalid="ignore"):
-            scale = max(1.0, float(result.measure[lp.cells].sum()))
+        scale = max(1.0, mass)
         if -1e-12 * scale <= stored - true <= MEASURE_TOLERANCE * scale and stored >= 0:
             return []
     elif stored == true:
@@ -135,10 +151,10 @@ def _residual(
     return [_differs("measure_residual", stored, true)]
 
 
-def _outside(lp: StabilizationLP, result: Result) -> list[str]:
+def outside(lp: StabilizationLP, result: Result) -> list[str]:
     """Check the arrays where they say that there is nothing: off C, and after a refusal on C."""
     attractor = lp.cell_status == CellStatus.ATTRACTOR
-    outside = lp.cell_status > CellStatus.STABILIZED
+    off_c = lp.cell_status > CellStatus.STABILIZED
     beyond = lp.cell_status == CellStatus.BEYOND_GAMMA
     expected: list[tuple[str, float, float, float]] = [  # on A, off C, on C if refused
         ("value", 0.0, np.inf, np.inf),
@@ -151,12 +167,12 @@ def _outside(lp: StabilizationLP, result: Result) -> list[str]:
         array, on = getattr(result, name), np.full(len(attractor), on_attractor)
         if name == "control_index" and lp.hold is not None and policy_of(lp, result) is not None:
             on = lp.hold  # and without a policy there is no law
-        sound = (array[attractor] == on[attractor]).all() and (array[outside] == off).all()
+        sound = (array[attractor] == on[attractor]).all() and (array[off_c] == off).all()
         if result.status == Status.NOT_STABILIZABLE:
             sound = sound and (array[lp.cells] == refused).all()
         if not sound:
             reasons.append(f"{name} has a wrong value where there is none to give")
-    if result.witness[attractor | (outside & ~beyond)].any():
+    if result.witness[attractor | (off_c & ~beyond)].any():
         reasons.append("witness has a wrong value outside the stabilizable set")
     return reasons
 
