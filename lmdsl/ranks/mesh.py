@@ -181,8 +181,8 @@ class Mesh:
         self.plans += 1
         chosen = np.unique(np.asarray(chosen, dtype=np.int64))
         wanted, slots = self.ghosts[chosen], chosen + self.own
-        owner = self.division.owner(wanted)
-        asked = {int(k): wanted[owner == k] for k in np.unique(owner)}
+        owned = self.division.by_owner(wanted)
+        asked = {k: wanted[own] for k, own in owned.items()}
         first, last = self.division.own(self.ranks.rank)
         send: dict[int, LocalNumbers] = {}
         for other, cells in self.ranks.exchange(asked).items():
@@ -191,8 +191,8 @@ class Mesh:
                     f"rank {other} asks rank {self.ranks.rank}, which has the cells {first} to "
                     f"{last - 1}, for others"
                 )
-            send[other] = cells - first
-        halo = Halo(self.ranks, self.plans, send, {k: slots[owner == k] for k in asked})
+            send[other] = (cells - first).astype(np.int64, copy=False)
+        halo = Halo(self.ranks, self.plans, send, {k: slots[own] for k, own in owned.items()})
         self.confirm(halo, slots)
         return halo
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Indices
+from lmdsl.common.types import Bools, Indices
 from lmdsl.ranks.verbs import RankError, Ranks
 
 RANGES = 4  # ranges of a model where the number of ranks divides it
@@ -48,6 +48,12 @@ class Division:
     def owner(self, cells: NDArray[np.integer]) -> Indices:
         """Return the rank of every cell."""
         return (np.searchsorted(self.starts[1:], cells, side="right")).astype(np.int64)
+
+    def by_owner(self, cells: NDArray[np.integer]) -> dict[int, Bools]:
+        """Return which cells a rank owns, of every rank that owns any."""
+        owner = self.owner(cells)
+        some = np.flatnonzero(np.bincount(owner, minlength=1)).tolist()
+        return {k: owner == k for k in some}
 
     @classmethod
     def cut(cls, pairs: NDArray[np.integer], count: int) -> "Division":

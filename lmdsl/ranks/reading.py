@@ -27,9 +27,9 @@ def read(ranks: Ranks, division: Division, cells: NDArray[np.integer], own: Floa
     if len(own) != last - first or division.cells >= NUMBERED:
         raise RankError(f"rank {ranks.rank} has {len(own)} values for {last - first} cells")
     cells = np.asarray(cells, dtype=np.int64)
-    owner = division.owner(cells)
     answers: dict[int, NDArray[Any]] = {}
-    asked = {int(k): cells[owner == k] for k in np.unique(owner)}
+    owned = division.by_owner(cells)
+    asked = {k: cells[own] for k, own in owned.items()}
     for other, wanted in ranks.exchange(asked).items():
         if len(wanted) and not (first <= wanted.min() and wanted.max() < last):
             raise RankError(f"rank {other} asks rank {ranks.rank} for cells that it has not")
@@ -42,7 +42,7 @@ def read(ranks: Ranks, division: Division, cells: NDArray[np.integer], own: Floa
         numbers, values = np.split(answer, 2)
         if not np.array_equal(numbers, asked[other]):
             raise RankError(f"rank {other} answers rank {ranks.rank} for other cells than asked")
-        found[owner == other] = values
+        found[owned[other]] = values
     return found
 
 
@@ -51,10 +51,9 @@ def added(
 ) -> Floats:
     """Return own values with what other ranks add to them, in the order of ranks; collective."""
     first, last = division.own(ranks.rank)
-    owner = division.owner(np.asarray(cells, dtype=np.int64))
     parcels = {
-        int(k): np.concatenate([cells[owner == k].astype(np.float64), values[owner == k]])
-        for k in np.unique(owner)
+        k: np.concatenate([cells[own].astype(np.float64), values[own]])
+        for k, own in division.by_owner(np.asarray(cells, dtype=np.int64)).items()
     }
     total = own.copy()
     for other, came in ranks.exchange(parcels).items():

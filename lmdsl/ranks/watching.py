@@ -1,12 +1,14 @@
 """Deadlines that also pass once another rank has failed: nobody waits for the end of vain work."""
 
+import math
 import threading
 import time
 
 from lmdsl.machine.deadline import Deadline
 from lmdsl.ranks.verbs import Elsewhere, Ranks
 
-EVERY = 0.1  # seconds after which it is asked again
+EVERY = 0.1  # seconds after which another rank is asked again
+MOMENT = 0.005  # seconds for which nothing is asked: work asks thousands of times
 
 
 class Watched(Deadline):
@@ -19,6 +21,7 @@ class Watched(Deadline):
         super().__init__(None)
         self.seconds, self.ranks, self.deadline = deadline.seconds, ranks, deadline
         self._thread, self._asked, self._failed = threading.get_ident(), 0.0, False
+        self._quiet = 0.0  # until when nothing is asked
 
     @property
     def failed(self) -> bool:
@@ -39,6 +42,15 @@ class Watched(Deadline):
 
     def raise_if_over(self, doing: str) -> None:
         """Raise :class:`Elsewhere` once another rank has failed, or that the time is up."""
+        now = time.monotonic()
+        if now < self._quiet:
+            return
         if self.failed:
             raise Elsewhere(f"another rank has failed while {doing}")
         super().raise_if_over(doing)
+        self._quiet = now + MOMENT
+
+    def cancel(self) -> None:
+        """End the work now."""
+        self._quiet = -math.inf
+        super().cancel()

@@ -6,12 +6,13 @@ What must hold: the LPs of all ranks, one after the other and in global numbers,
 
 import math
 from dataclasses import replace
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
 
 from lmdsl.common.on_disk import Disk, beside, taken
-from lmdsl.common.types import Floats, Indices, Statuses
+from lmdsl.common.types import Bools, Floats, Indices, Statuses
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.substeps import settled
@@ -50,7 +51,7 @@ def compiled(
     cells = pairs.sets.free[first:last][inside]
     part = _part(pairs)
     level, pair = found.level[inside], found.pair[inside]
-    per_cell = np.diff(np.append(0, np.cumsum(found.surviving))[pairs.pair_pointer])[inside]
+    per_cell = _per_cell(pairs.pair_pointer, found.surviving)[inside]
     return StabilizationLP(
         problem=problem,
         partition=partition,
@@ -69,6 +70,13 @@ def compiled(
         mesh=mesh,
         _known=(level, pair if isinstance(kept, slice) else np.searchsorted(kept, pair)),
     )
+
+
+def _per_cell(pair_pointer: Indices, surviving: Bools) -> Indices:
+    """Return the number of surviving pairs of every cell."""
+    if surviving.all():
+        return np.diff(pair_pointer)
+    return np.diff(np.append(0, np.cumsum(surviving))[pair_pointer])
 
 
 def _restricted(pairs: OwnPairs, found: Stabilizable) -> tuple[Mesh, Indices | slice, Rows]:
@@ -148,10 +156,14 @@ def _weight(ranks: Ranks, sets: CellSets, cells: Indices) -> Floats:
 
 def _ends_of(mass: Floats) -> tuple[float, float, list[float]]:
     """Return the least and largest mass, and doubles whose sum is exactly that of all."""
+    low, high = float(mass.min(initial=np.inf)), float(mass.max(initial=0.0))
+    if low == high:  # a product of integers of 53 bits: two doubles hold it
+        total = Fraction(low) * len(mass)
+        return low, high, [float(total), float(total - Fraction(float(total)))]
     exactly: list[float] = []
     while (rest := math.fsum([*mass, *(-x for x in exactly)])) != 0:
         exactly.append(rest)
-    return float(mass.min(initial=np.inf)), float(mass.max(initial=0.0)), exactly
+    return low, high, exactly
 
 
 def local(lp: StabilizationLP) -> StabilizationLP:

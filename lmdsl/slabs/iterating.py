@@ -41,15 +41,17 @@ def iterated(
         # As one process: passes read less than an evaluation where few controls change.
         few = steps == 1 or changed * FEW < first.mesh.division.cells
         unevaluated = changed > 0 and few and not unevaluated and not out
-        lower = done.value if unevaluated else None
-        if changed and not unevaluated and not out:
-            lower = by.lower(done.policy, done.value, screen)
         before, last = last, None
-        if lower is None:
-            try:
-                lower = by.value(done.policy, done.value, screen)
-            except Stopped:  # on all ranks
-                return *(before or (policy, V)), screen, steps
+        try:
+            if unevaluated:
+                lower, exact = done.value, False
+            elif changed and not out:
+                lower, exact = by.lower(done.policy, done.value, screen)
+            else:
+                lower, exact = by.value(done.policy, done.value, screen), True
+        except Stopped:  # on all ranks
+            return *(before or (policy, V)), screen, steps
+        if exact:
             _require_fallen(first, V, lower)
             if before is not None and not ranks.any(bool((lower < before[1]).any())):
                 return *before, screen, steps  # rounding made a change look better than it is

@@ -38,8 +38,8 @@ class Evaluator(Protocol):
     def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
         """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
 
-    def lower(self, policy: Policy, V: Floats, screen: Screen) -> Floats | None:
-        """Return a lower V >= T_u V for V >= T_u V; None where the value is as soon known."""
+    def lower(self, policy: Policy, V: Floats, screen: Screen) -> tuple[Floats, bool]:
+        """Return a lower V >= T_u V for V >= T_u V, and whether it is the value."""
 
     def value(self, policy: Policy, start: Floats, screen: Screen | None = None) -> Floats:
         """Return the value of a g-stabilizing policy; its rows may be in a screen."""
@@ -54,9 +54,9 @@ class ByFirst:
 
     first: First
 
-    def lower(self, policy: Policy, V: Floats, screen: Screen) -> Floats | None:
-        """Return None."""
-        return None
+    def lower(self, policy: Policy, V: Floats, screen: Screen) -> tuple[Floats, bool]:
+        """Return the value: as soon known as anything else."""
+        return self.value(policy, V), True
 
     def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
         """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
@@ -194,11 +194,16 @@ class ByAll:
             V = w * (max(self.mesh.ranks.collect(own)) * (1 + 1e-12))
         return None if self.mesh.ranks.any(not (V < CEILING).all()) else V
 
-    def lower(self, policy: Policy, V: Floats, screen: Screen) -> Floats | None:
-        """Return V after a few sweeps of the core, exact outside."""
-        x = V.copy()
-        chain = self.chain(policy, self.lp.gamma, screen)
-        return np.minimum(x, V) if chain.advance(self.lp.cost[policy], x, FEW, 0.0) < np.inf else V
+    def lower(self, policy: Policy, V: Floats, screen: Screen) -> tuple[Floats, bool]:
+        """Return V after a few sweeps of the core, exact outside, and whether it is the value."""
+        x, cost = V.copy(), self.lp.cost[policy]
+        change = self.chain(policy, self.lp.gamma, screen).advance(cost, x, FEW, 0.0)
+        if not change < np.inf:
+            return V, False
+        positive = bool((cost > 0).all())  # else what is free has to become 0
+        if change <= TOLERANCE and self.mesh.ranks.all(positive):
+            return x, True
+        return np.minimum(x, V), False
 
     def value(self, policy: Policy, start: Floats, screen: Screen | None = None) -> Floats:
         """Return the value of a g-stabilizing policy."""
