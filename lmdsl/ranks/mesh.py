@@ -180,7 +180,8 @@ class Mesh:
         """
         self.plans += 1
         chosen = np.unique(np.asarray(chosen, dtype=np.int64))
-        wanted, slots = self.ghosts[chosen], chosen + self.own
+        wanted = self.ghosts[chosen]
+        slots: LocalNumbers = chosen + self.own
         owned = self.division.by_owner(wanted)
         asked = {k: wanted[own] for k, own in owned.items()}
         first, last = self.division.own(self.ranks.rank)
