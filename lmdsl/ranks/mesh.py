@@ -181,7 +181,7 @@ class Mesh:
         self.plans += 1
         chosen = np.unique(np.asarray(chosen, dtype=np.int64))
         wanted = self.ghosts[chosen]
-        slots: LocalNumbers = chosen + self.own
+        slots = (chosen + self.own).astype(np.int64, copy=False)
         owned = self.division.by_owner(wanted)
         asked = {k: wanted[own] for k, own in owned.items()}
         first, last = self.division.own(self.ranks.rank)
