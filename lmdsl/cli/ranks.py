@@ -99,8 +99,9 @@ def _solve(ranks: Ranks, parsed: Arguments) -> int:
     if parsed.out is not None:
         saving.require_place(ranks, parsed.out)
     problem = ranks.agreed(lambda: problem_asked(parsed))
-    options = parsed.tolerance, parsed.time_limit, parsed.require_all, parsed.restrict_to_gamma
-    wanted = ranks.agreed(lambda: solving.asked(problem, *options))
+    names = ("tolerance", "time_limit", "require_all", "restrict_to_gamma", *solving.FOLDERS)
+    options = {name: getattr(parsed, name) for name in names}
+    wanted = ranks.agreed(lambda: solving.asked(problem, **options))
     with ProgressLine() as progress:
         found = solving.solved(ranks, problem, wanted, progress if ranks.rank == 0 else None)
     if not parsed.json:  # reported first: whatever saving meets, the answer was given
@@ -149,7 +150,6 @@ def _require_supported(parsed: Arguments) -> None:
         "--backend": parsed.backend != "policy-iteration",
         "--max-iterations": parsed.max_iterations is not None,
         "--proved": parsed.proved is not None,
-        "--rows-on-disk": parsed.rows_on_disk is not None,
     }
     for name, asked in given.items():
         if asked:

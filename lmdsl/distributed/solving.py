@@ -27,6 +27,9 @@ def solve(
     time_limit: float | None = None,
     require_all: bool = False,
     restrict_to_gamma: bool = False,
+    rows_on_disk: FilePath | None = None,
+    checkpoint: FilePath | None = None,
+    resume: FilePath | None = None,
     progress: Progress | bool | None = None,
     ranks: Ranks | None = None,
 ) -> Answer:
@@ -40,6 +43,8 @@ def solve(
         The result directory that all ranks write, in a folder that all of them see.
     tolerance, time_limit, require_all, restrict_to_gamma
         As for :func:`lmdsl.solve`.
+    rows_on_disk, checkpoint, resume
+        As for :func:`lmdsl.solve`; the last two in a folder that all ranks see.
     progress
         Of rank 0: called with (stage, fraction done, or -1); True shows it on stderr.
     ranks
@@ -60,8 +65,12 @@ def solve(
 
     def program(ranks: Ranks) -> Answer:
         declared = ranks.agreed(lambda: given(problem))
-        options = tolerance, time_limit, require_all, restrict_to_gamma
-        wanted = ranks.agreed(lambda: asked(declared, *options))
+        wanted = ranks.agreed(
+            lambda: asked(
+                declared, tolerance, time_limit, require_all, restrict_to_gamma,
+                rows_on_disk=rows_on_disk, checkpoint=checkpoint, resume=resume,
+            )
+        )  # fmt: skip
         if out is not None:
             saving.require_place(ranks, out)
         found = solved(ranks, declared, wanted, heard)
@@ -81,13 +90,17 @@ def solved(
     return answer(ranks, problem, wanted, progress)
 
 
+FOLDERS = ("rows_on_disk", "checkpoint", "resume")
+
+
 def asked(
-    problem: Problem, tolerance: Any, time_limit: Any, require_all: Any, restrict_to_gamma: Any
-) -> Wanted:
-    """Return what is asked for; BadInput where it cannot be."""
+    problem: Problem, tolerance: Any, time_limit: Any, require_all: Any, restrict_to_gamma: Any,
+    **folders: Any,
+) -> Wanted:  # fmt: skip
+    """Return what is asked for; BadInput where it cannot be. ``folders`` are FOLDERS."""
     _check_options(tolerance, None)
     whole = inputs.flag(require_all, "require_all")
     restricted = inputs.flag(restrict_to_gamma, "restrict_to_gamma")
     if restricted:
         _no_enclosures(problem)
-    return Wanted(tolerance, Deadline.of(time_limit), whole, restricted)
+    return Wanted(tolerance, Deadline.of(time_limit), whole, restricted, **folders)
