@@ -8,6 +8,8 @@ import sys
 import time
 from types import FrameType
 
+from lmdsl.ranks.launchers import launched
+
 PATIENCE = 5.0  # seconds that an interrupted command has to end by itself
 
 _ended = False
@@ -50,6 +52,8 @@ def _end() -> None:
 
 
 def _say_interrupted() -> None:
+    if launched().rank:  # of several; the first one says it
+        return
     with contextlib.suppress(OSError):
         os.write(2, (b"\r\x1b[K" if os.isatty(2) else b"") + b"lmdsl: interrupted\n")
 

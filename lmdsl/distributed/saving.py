@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from lmdsl.common import arrays
 from lmdsl.common.files import reason, synced
 from lmdsl.distributed.answer import Answer
-from lmdsl.errors import BadInput, LmdslError, shown
+from lmdsl.errors import BadInput, shown
 from lmdsl.ranks.verbs import Item, Ranks
 from lmdsl.results.directory import archive, reading, vectors, writing
 
@@ -49,7 +49,7 @@ def save(ranks: Ranks, answer: Answer, path: str | os.PathLike[str]) -> None:
             for name, file in names.items()
         }
         _agreed(ranks, path, lambda: _finish(begun, answer, digests) if begun else None)
-    except LmdslError:
+    except Exception:  # on all ranks
         if begun:
             with contextlib.suppress(OSError):
                 begun.abandon()
