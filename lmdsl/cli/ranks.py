@@ -8,13 +8,15 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from lmdsl import cli
 from lmdsl.cli.output import Arguments, ProgressLine, answer, narrated, print_json
-from lmdsl.cli.solving import problem_asked, simulated, summary
+from lmdsl.cli.results import tell_runs
+from lmdsl.cli.solving import SECONDS, STARTS, STEPS, problem_asked, summary
 from lmdsl.cli.streams import kept, muted, say
-from lmdsl.errors import BadInput, MissingDependency, printable
+from lmdsl.errors import BadInput, MissingDependency, plain_text, printable
 from lmdsl.ranks.ending import together
 from lmdsl.ranks.launchers import Launched
 from lmdsl.ranks.mpi import at_hand
@@ -74,7 +76,7 @@ def _command(parsed: Arguments) -> Callable[[Ranks, Arguments], int]:
     """Return what runs a command over ranks."""
     if parsed.command in BY_FIRST:
         return _by_first
-    known: dict[str, Callable[[Ranks, Arguments], int]] = {"solve": _solve, "verify": _verify}
+    known = {"solve": _solve, "verify": _verify, "simulate": _simulate}
     return known.get(parsed.command, _refuse)
 
 
@@ -113,7 +115,7 @@ def _solve(ranks: Ranks, parsed: Arguments) -> int:
             if not parsed.json:
                 say(f"written to {printable(parsed.out)}")
         if parsed.simulate and found.model_sha256:
-            result = simulated_by_first(ranks, found)
+            result = _with_runs(ranks, found, parsed, parsed.out is not None)
     finally:
         if parsed.json:
             print_json(result.to_dict())
@@ -135,13 +137,41 @@ def _verify(ranks: Ranks, parsed: Arguments) -> int:
     return 0 if found.holds else 1
 
 
-def simulated_by_first(ranks: Ranks, answer: Any) -> Any:
-    """Return an answer with the runs that rank 0 makes, on rank 0."""
-    from lmdsl.distributed.using import in_use
+def _simulate(ranks: Ranks, parsed: Arguments) -> int:
+    """Make runs, divided among the ranks; those that are asked for otherwise by rank 0 alone."""
+    from lmdsl.distributed import simulating
+    from lmdsl.results.result import Result
 
-    whole = in_use(ranks, answer)
-    found = ranks.agreed(lambda: None if whole is None else simulated(whole))
-    return answer if found is None else answer.with_runs(found.simulation)
+    if parsed.given or parsed.parameter or parsed.interpolated or parsed.as_compiled:
+        return _by_first(ranks, parsed)
+    law = ranks.agreed(lambda: simulating.stored(Result.load(parsed.dir)))
+    with ProgressLine() as progress:
+        progress("simulate", -1.0)
+        runs = simulating.simulated(ranks, law, parsed.starts, parsed.steps, parsed.seed,
+                                    parsed.hold, parsed.time_limit)  # fmt: skip
+    tell_runs([runs], parsed.json)
+    return 0
+
+
+def _with_runs(ranks: Ranks, found: Any, parsed: Arguments, saved: bool) -> Any:
+    """Return an answer with runs of the true map, where there is a controller."""
+    from lmdsl.distributed import simulating
+
+    if not ranks.any(bool((found.control_index >= 0).any())):
+        return found
+    law = simulating.gathered(ranks, found) if not saved else ranks.agreed(
+        lambda: simulating.saved(found, Path(parsed.out))
+    )  # fmt: skip
+    try:
+        with ProgressLine() as progress:
+            progress("simulate", -1.0)
+            runs = simulating.simulated(ranks, law, STARTS, STEPS, time_limit=SECONDS)
+    except Exception as error:
+        if not getattr(error, "agreed", False):
+            raise
+        print(f"lmdsl: not simulated: {plain_text(error)}", file=sys.stderr)
+        return found
+    return found.with_runs(runs)
 
 
 def _require_supported(parsed: Arguments) -> None:

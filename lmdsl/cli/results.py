@@ -1,7 +1,11 @@
 """What is done with a result directory: ``verify``, ``simulate``, ``prove`` and others."""
 
+from __future__ import annotations
+
 import sys
+from collections.abc import Sequence
 from importlib import import_module
+from typing import TYPE_CHECKING
 
 from lmdsl.cli import plotting
 from lmdsl.cli.output import AS_STORED, Arguments, Command, ProgressLine, answer, print_json, shared
@@ -9,6 +13,9 @@ from lmdsl.cli.streams import say
 from lmdsl.cli.values import parameters, states
 from lmdsl.errors import printable
 from lmdsl.results.formats import FORMATS
+
+if TYPE_CHECKING:
+    from lmdsl.control.simulation import Simulation
 
 
 def add(command: Command) -> None:
@@ -103,13 +110,18 @@ def _simulate(parsed: Arguments) -> int:
             )
             for law in laws[: 1 + parsed.interpolated]
         ]  # fmt: skip
-    if parsed.json:
+    tell_runs(found, parsed.json)
+    return 0
+
+
+def tell_runs(found: Sequence[Simulation], as_json: bool) -> None:
+    """Say what became of runs, by each law of the controller."""
+    if as_json:
         report, *others = (runs.to_dict() for runs in found)
         print_json({**report, "interpolated": others[0] if others else None})
         print(f"lmdsl: {AS_STORED}", file=sys.stderr)
-        return 0
+        return
     say("\n".join([*(runs.text() for runs in found), f"({AS_STORED})"]))
-    return 0
 
 
 def _prove(parsed: Arguments) -> int:

@@ -104,7 +104,7 @@ def _solve(parsed: Arguments) -> int:
         if parsed.out is not None and result.lp is not None:  # else no time to compile
             status = _saved(result, parsed)
         if parsed.simulate:
-            result = simulated(result)
+            result = _simulated(result)
     finally:
         if parsed.json:
             print_json(result.to_dict())
@@ -130,7 +130,7 @@ def _saved(result: Any, parsed: Arguments) -> int:
     return int(result.exit_status)
 
 
-def simulated(result: Any) -> Any:
+def _simulated(result: Any) -> Any:
     """Return a result with runs of the true map, where there is a controller."""
     if (result.control_index < 0).all():
         return result

@@ -33,10 +33,7 @@ def save(ranks: Ranks, answer: Answer, path: str | os.PathLike[str]) -> None:
     BadInput: the place cannot be used, or not all ranks see it.
     """
     target = require_place(ranks, path)
-    if answer.problem.functions:
-        raise BadInput("what Python functions gave is not saved by several ranks", "out")
-    if not answer.model_sha256:
-        raise BadInput("there is no model to save: " + answer.message, "out")
+    ranks.agreed(lambda: _require_model(answer))
     begun = _agreed(ranks, path, lambda: writing.Begun(target) if ranks.rank == 0 else None)
     names = {name: f"{name}.npy" for name in answer.arrays()}
     places = ranks.share({n: begun.path(file) for n, file in names.items()} if begun else {})
@@ -54,6 +51,13 @@ def save(ranks: Ranks, answer: Answer, path: str | os.PathLike[str]) -> None:
             with contextlib.suppress(OSError):
                 begun.abandon()
         raise
+
+
+def _require_model(answer: Answer) -> None:
+    if answer.problem.functions:
+        raise BadInput("what Python functions gave is not saved by several ranks", "out")
+    if not answer.model_sha256:
+        raise BadInput("there is no model to save: " + answer.message, "out")
 
 
 def _agreed(ranks: Ranks, path: str | os.PathLike[str], work: Callable[[], Item]) -> Item:

@@ -9,11 +9,13 @@ anew. Every rank reads the controls and statuses of the whole box: 5 bytes a cel
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lmdsl.common import arrays, inputs
 from lmdsl.common.types import Floats, Guard, Statuses
 from lmdsl.control.controller import Controller
 from lmdsl.control.loop import ClosedLoop, draw_starts
@@ -21,6 +23,7 @@ from lmdsl.control.simulation import Simulation, simulate
 from lmdsl.control.steps import Moved, Steps
 from lmdsl.distributed.answer import Answer
 from lmdsl.errors import BadInput
+from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
 from lmdsl.model.grid.partition import Partition
@@ -29,6 +32,8 @@ from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.ranks.verbs import Ranks
+from lmdsl.results.directory import vectors
+from lmdsl.results.result import Result
 from lmdsl.systems.named import NotStored
 
 ALIGNED = 64  # runs: their steps are divided at multiples, where no loop is in the middle of a word
@@ -60,6 +65,21 @@ def gathered(ranks: Ranks, answer: Answer) -> Controlled:
     return Controlled(answer.problem, answer.partition, answer.control_vectors, index, status)
 
 
+def stored(result: Result) -> Controlled:
+    """Return the controller of a saved result, which every rank reads: its files are mapped."""
+    return Controlled(result.problem, result.partition, result.control_vectors,
+                      result.control_index, result.cell_status)  # fmt: skip
+
+
+def saved(answer: Answer, path: Path) -> Controlled:
+    """Return the controller of an answer that all ranks have saved, mapped from its files."""
+    N, found = answer.partition.size, []
+    for name in ("control_index", "cell_status"):
+        with open(path / f"{name}.npy", "rb") as file:
+            found.append(arrays.mapped(file, f"{name}.npy", (N,), vectors.TYPES[name]))
+    return Controlled(answer.problem, answer.partition, answer.control_vectors, *found)
+
+
 def simulated(
     ranks: Ranks,
     law: Controlled,
@@ -70,8 +90,8 @@ def simulated(
     time_limit: float | Deadline | None = None,
 ) -> Simulation:
     """Run the true map under a controller, as :meth:`lmdsl.Result.simulate` does; collective."""
-    if (law.control_index < 0).all():  # on every rank
-        raise BadInput("there is no controller to simulate")
+    asked = starts, steps, seed, hold, time_limit
+    starts, steps, seed, hold, deadline = ranks.agreed(lambda: _asked(law, *asked))
     rng = np.random.default_rng(seed)
     first = ranks.rank == 0
     drawn = ranks.agreed(lambda: _starts(law, starts, rng) if first else None)
@@ -79,9 +99,20 @@ def simulated(
     assert x is not None
     rng = np.random.default_rng(seed)
     rng.bit_generator.state = state
-    deadline = Deadline.of(time_limit)
     loop = ranks.agreed(lambda: DividedLoop(ranks, law, deadline))
     return simulate(loop, x.copy(), steps, rng, hold, AskedTogether(ranks, deadline))
+
+
+def _asked(
+    law: Controlled, starts: Any, steps: Any, seed: Any, hold: Any, time_limit: Any
+) -> tuple[int, int, int, int, Deadline]:
+    """Return what is asked for; BadInput where it cannot be."""
+    if (law.control_index < 0).all():
+        raise BadInput("there is no controller to simulate")
+    starts, steps = inputs.whole(starts, "starts"), inputs.whole(steps, "steps")
+    hold, seed = inputs.whole(hold, "hold"), inputs.seed(seed)
+    memory.require(8 * starts * (16 * len(law.partition.names) + 12), "runs")
+    return starts, steps, seed, hold, Deadline.of(time_limit)
 
 
 def _starts(law: Controlled, count: int, rng: np.random.Generator) -> Floats:

@@ -85,6 +85,12 @@ def test_solve_says_what_one_process_says(tmp_path, file, capsys):
     done = over(2, "verify", tmp_path / "two")
     assert (done.returncode, done.stderr) == (status, "")
     assert numbers_out(done.stdout) == numbers_out(out)
+    for more in (["--starts", "50"], ["--from", "0.1,0.2", "--json"]):
+        _, out, _ = run(capsys, "simulate", tmp_path / "two", *more)
+        done = over(2, "simulate", tmp_path / "two", *more)
+        assert (done.returncode, done.stdout) == (0, out)
+    done = over(2, "simulate", tmp_path / "two", "--starts", "0")
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
 
 
 @needs_mpi
