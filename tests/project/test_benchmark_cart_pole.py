@@ -45,6 +45,7 @@ def test_other_shapes_are_refused(text):
 
 
 @pytest.mark.long
+@pytest.mark.full
 @needs_mpi
 def test_two_ranks_tell_what_they_took(tmp_path):
     told = cart_pole.solved((8, 16, 16, 16), 2, tmp_path / "out", 300)

@@ -84,6 +84,14 @@ def test_the_pole_swings_up_from_hanging(place):
     assert energy(path.states[0]) < 0.49 - 0.9 < energy(path.states[-1])
 
 
+def test_the_pole_is_balanced_once_it_is_up():
+    """By the regulator in A; a run that leaves A on its way to rest is brought back."""
+    held = solved("cart_pole").simulate(300, 1000, seed=2, hold=100).held
+    assert held.lost == 0
+    assert held.away <= 0.05 * 300
+    assert held.distance[0] < 1e-6  # the median, in cells from the upright
+
+
 def test_the_cart_moves_under_the_falling_pole():
     """Near the middle of the rail, of all cells in which the pole falls slowly to the right."""
     result = solved("cart_pole")
@@ -97,6 +105,7 @@ def test_the_cart_moves_under_the_falling_pole():
 
 def test_no_run_arrives_without_force():
     """A pole that hangs stays there: nothing below the upright's energy is stabilizable."""
-    idle = lm.solve(variant("cart_pole", control_grid={"u": {"values": [0]}}))
+    nothing = {"control_grid": {"u": {"values": [0]}}, "local_controller": None}
+    idle = lm.solve(variant("cart_pole", **nothing))
     centres = idle.partition.centres(np.flatnonzero(idle.cell_status == 1)).T
     assert energy(centres).min(initial=np.inf) > 0
