@@ -22,7 +22,8 @@ from lmdsl.results.job import ruled_out
 from lmdsl.results.result import Result
 from lmdsl.slabs import compiling, solving
 from lmdsl.slabs.chains.evaluating import MOST_GATHERED
-from lmdsl.slabs.gamma import whole
+from lmdsl.slabs.gamma import bracket, whole
+from lmdsl.slabs.gamma.restricting import restricted
 
 
 class Wanted(NamedTuple):
@@ -111,7 +112,24 @@ def _answered(
         return maker.solved(found, late)
     if not late and whole.fits(lp, wanted.whole):
         return _by_first(maker, lp, wanted)
+    if found is not None and found.certificate.refusal:
+        return _infeasible(maker, lp, wanted, found)
     return maker.solved(found, late)
+
+
+def _infeasible(
+    maker: AnswerMaker, lp: StabilizationLP, wanted: Wanted, found: solving.Solved
+) -> Answer:
+    """Return the refusal of gamma, or the answer on the other cells, as all ranks find it."""
+    w = found.witness.refusal
+    assert w is not None
+    if wanted.restrict_to_gamma:
+        smaller = restricted(lp, w > 0, maker.first_cell)
+        if smaller is not None:
+            inner = maker.for_model()
+            return maker.restricted(_answered(inner, smaller, wanted, None, None, None), w)
+    limits = bracket.bracket(lp, w, wanted.gathered, maker.ranks.time_up(maker.deadline))
+    return maker.infeasible(found, w, limits)
 
 
 def _by_first(maker: AnswerMaker, lp: StabilizationLP, wanted: Wanted) -> Answer:

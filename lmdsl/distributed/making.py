@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.certificate.claims import Certificate, Witness
-from lmdsl.common.types import Floats, Indices
+from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.control.accuracy import IntegrationError, integration_error
 from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.staying import check_of
@@ -18,19 +18,22 @@ from lmdsl.data.report import DataReport
 from lmdsl.distributed.answer import Answer
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.discretization import control_count, control_vectors
+from lmdsl.model.grid.boxes import Area
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.sets import attractor_note
 from lmdsl.model.stabilizable_set import CellStatus, sets_of
+from lmdsl.optimize.feasibility.restriction import refusal_message
 from lmdsl.problem.problem import Problem
-from lmdsl.ranks.verbs import Alone, Item, Ranks
-from lmdsl.results.job import Extent, success, together
+from lmdsl.ranks.verbs import Alone, Item, RankError, Ranks
+from lmdsl.results.job import Extent, left_out, success, together
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Seconds, Summary
 from lmdsl.slabs import digest
 from lmdsl.slabs.gamma import whole
+from lmdsl.slabs.gamma.restricting import restricted
 from lmdsl.slabs.solving import Solved
 from lmdsl.systems import DataSystem
 
@@ -110,9 +113,6 @@ class AnswerMaker:
         if proof.verified:
             message = success(self.lp.problem, self.extent, proof.gap)
             status, word = Status.VERIFIED, "optimal"
-        elif proof.refusal:
-            message = "; ".join(proof.reasons)
-            return self._made(witness, proof, Status.NOT_STABILIZABLE, message, cause=Cause.GAMMA)
         else:
             status = Status.SOLVER_FAILED if late else Status.UNVERIFIED
             word = "time limit" if late else "undecided"
@@ -120,6 +120,41 @@ class AnswerMaker:
         steps = None if found is None else found.steps
         return self._made(
             witness, proof, status, message, solver_status=word, iterations=steps, polish_steps=0
+        )
+
+    def infeasible(self, found: Solved, w: Floats, limits: tuple[float, float]) -> Answer:
+        """Return the refusal of a gamma; collective."""
+        area = self._area(w > 0)
+        assert area is not None
+        lp = self.lp
+        message = refusal_message(lp.problem, self.extent.inside, area, None, limits)
+        proof = replace(found.certificate, reasons=(message,))
+        return self._made(found.witness, proof, Status.NOT_STABILIZABLE, message,
+                          cause=Cause.GAMMA, gamma_bar=limits, area=area)  # fmt: skip
+
+    def restricted(self, inner: Answer, w: Floats) -> Answer:
+        """Add to the answer on the feasible cells the proof that the others are not; collective."""
+        count = sum(self.ranks.collect(int((w > 0).sum())))
+        return replace(
+            inner, witness=inner.witness + self._over(w, 0.0, 0.0, 0.0), area=self._area(w > 0),
+            message=f"{inner.message}; {left_out(count)}",
+            seconds=replace(inner.seconds, compile=self.compile_seconds),
+        )  # fmt: skip
+
+    def for_model(self) -> "AnswerMaker":
+        """Return what makes answers of another model of the same problem."""
+        return AnswerMaker(self.ranks, self.problem, self.tolerance, self.deadline)
+
+    @property
+    def first_cell(self) -> int:
+        """The first cell of the own part of the box."""
+        return int(self.starts[self.ranks.rank])
+
+    def _area(self, chosen: Bools) -> Area | None:
+        """Return own cells of C and those of other ranks by region; None for none; collective."""
+        cells = self.ranks.gathered(self.lp.cells[chosen])
+        return self.by_first(
+            lambda: None if cells is None or not len(cells) else Area.of(self.lp.partition, cells)
         )
 
     def told(self, result: Result | None) -> Answer:
@@ -134,9 +169,19 @@ class AnswerMaker:
             facts["sure"], facts["area"] = result.sure_cells, result.beyond_gamma
             facts["model_sha256"] = digest.of_model(Alone(), result.lp)
         facts = self.ranks.share(facts)
+        assert facts is not None
         arrays: dict[str, Any] = {name: self._scattered(result, name) for name in ARRAYS}
         return Answer(**facts, **arrays, partition=self.lp.partition, starts=self.starts,
-                      control_vectors=self.lp.controls, lp=self.lp)  # fmt: skip
+                      control_vectors=self.lp.controls, lp=self._left(facts, arrays))  # fmt: skip
+
+    def _left(self, facts: dict[str, Any], arrays: dict[str, Any]) -> StabilizationLP:
+        """Return the model of which rank 0 speaks, as it was asked, of own cells; collective."""
+        lp, status = self.lp, arrays["cell_status"]
+        out = status[lp.cells - self.first_cell] == CellStatus.BEYOND_GAMMA
+        left = restricted(lp, out, self.first_cell) if self.ranks.any(bool(out.any())) else lp
+        if left is None or digest.of_model(self.ranks, left) != facts["model_sha256"]:
+            raise RankError("rank 0 speaks of another model than that of all ranks")
+        return left
 
     def _scattered(self, result: Result | None, name: str) -> NDArray[Any] | None:
         """Return the own part of an array that rank 0 has, None where it has none."""

@@ -1,5 +1,6 @@
 """A first policy over ranks: one that is proved to be g-stabilizing."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -52,10 +53,22 @@ def soon(first: First, by: Evaluator) -> tuple[Policy, Floats] | None:
 def raised(
     lp: StabilizationLP, by: Evaluator, gathered: int, time_up: TimeUp
 ) -> tuple[Policy, Floats] | None:
-    """Return the same by raising gamma in steps, as :func:`first_policy.stabilizing` does.
+    """Return the same by raising gamma in steps; None where that does not lead there."""
+    for _, policy, V in climbing(lp, gathered, time_up):
+        found = by.bound(policy, V)
+        if found is not None:
+            return policy, found
+    return None
+
+
+def climbing(
+    lp: StabilizationLP, gathered: int, time_up: TimeUp
+) -> Iterator[tuple[float, Policy, Floats]]:
+    """Raise gamma in steps, as :func:`first_policy.stabilizing` does.
 
     From gamma = 1 - 1/h, at which no policy costs more than h under unit cost, each step goes as
-    far towards g as the optimal policy of the last one allows. Collective.
+    far towards g as the optimal policy of the last one allows. Yields every gamma, a policy that is
+    stabilizing there, and its value under unit cost. Collective.
     """
     ranks = First(lp).mesh.ranks
     level, policy = lp._algorithm_1
@@ -65,19 +78,16 @@ def raised(
         unit = _unit(lp, at)
         policy, V, _, _ = iterated(First(unit), evaluator(unit, gathered, time_up), policy, V,
                                    time_up)  # fmt: skip
-        found = by.bound(policy, V)
-        if found is not None:
-            return policy, found
+        yield at, policy, V
         if time_up():
-            return None
+            return
         reach, higher = lp.growth, None
         while higher is None and reach > at * (1 + NEAREST):
             reach = at + (reach - at) / 2
             higher = evaluator(_unit(lp, reach), gathered, time_up).bound(policy, V)
         if higher is None:
-            return None
+            return
         at, V = reach, higher
-    return None
 
 
 def _unit(lp: StabilizationLP, gamma: float) -> StabilizationLP:

@@ -46,7 +46,7 @@ def compiled(
     found = levels.stabilizable(pairs.mesh, pairs.pair_pointer, rows, deadline,
                                 pairs.successors, pairs.left)  # fmt: skip
     inside = found.inside[: pairs.mesh.own]
-    mesh, kept, own = _restricted(pairs, found)
+    mesh, kept, own = kept_part(pairs.mesh, pairs.rows, inside, found.surviving)
     first, last = pairs.mesh.division.own(ranks.rank)
     cells = pairs.sets.free[first:last][inside]
     part = _part(pairs)
@@ -79,25 +79,28 @@ def _per_cell(pair_pointer: Indices, surviving: Bools) -> Indices:
     return np.diff(np.append(0, np.cumsum(surviving))[pair_pointer])
 
 
-def _restricted(pairs: OwnPairs, found: Stabilizable) -> tuple[Mesh, Indices | slice, Rows]:
-    """Return the mesh of C, the pairs that survive, and their rows in its local numbers."""
-    before, rows = pairs.mesh, pairs.rows
-    inside = found.inside[: before.own]
-    if before.ranks.all(bool(inside.all() and found.surviving.all())):
+def kept_part(
+    before: Mesh, rows: Rows, inside: Bools, surviving: Bools
+) -> tuple[Mesh, Indices | slice, Rows]:
+    """Return the mesh of own cells that stay, the pairs that do, and rows in its local numbers.
+
+    Every row that is kept leads to cells that stay, of any rank. Collective.
+    """
+    if before.ranks.all(bool(inside.all() and surviving.all())):
         return before, slice(None), rows
     division = before.division.within(before.ranks, inside)
     number = np.full(before.own, -1, dtype=np.int64)
     number[inside] = division.own(before.ranks.rank)[0] + np.arange(inside.sum())
     numbers = before.spread(number, division.cells)
-    count = int(found.surviving.sum())
+    count = int(surviving.sum())
     kept_pairs = beside(rows.target, count, np.int64)
     pointer = beside(rows.target, count + 1, np.int64)
     pointer[0] = 0
-    entries = _ends(found.surviving, rows.pointer, kept_pairs, pointer)
+    entries = _ends(surviving, rows.pointer, kept_pairs, pointer)
     target = beside(rows.target, entries, np.int32)
     code = beside(rows.target, entries, rows.code.dtype)
     same = np.arange(before.columns + 1, dtype=np.int32)
-    _keep(found.surviving, rows.pointer, rows.target, rows.code, same, target, code)
+    _keep(surviving, rows.pointer, rows.target, rows.code, same, target, code)
     used = np.zeros(before.columns + 1, dtype=np.bool_)
     used[target] = True
     named = np.flatnonzero(used)
@@ -156,14 +159,18 @@ def _weight(ranks: Ranks, sets: CellSets, cells: Indices) -> Floats:
 
 def _ends_of(mass: Floats) -> tuple[float, float, list[float]]:
     """Return the least and largest mass, and doubles whose sum is exactly that of all."""
-    low, high = float(mass.min(initial=np.inf)), float(mass.max(initial=0.0))
-    if low == high:  # a product of integers of 53 bits: two doubles hold it
-        total = Fraction(low) * len(mass)
-        return low, high, [float(total), float(total - Fraction(float(total)))]
+    return float(mass.min(initial=np.inf)), float(mass.max(initial=0.0)), exact_sum(mass)
+
+
+def exact_sum(mass: Floats) -> list[float]:
+    """Return doubles whose sum is exactly that of all."""
+    if len(mass) and mass.min() == mass.max():  # a product of integers of 53 bits: two hold it
+        total = Fraction(float(mass[0])) * len(mass)
+        return [float(total), float(total - Fraction(float(total)))]
     exactly: list[float] = []
     while (rest := math.fsum([*mass, *(-x for x in exactly)])) != 0:
         exactly.append(rest)
-    return low, high, exactly
+    return exactly
 
 
 def local(lp: StabilizationLP) -> StabilizationLP:

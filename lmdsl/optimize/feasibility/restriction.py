@@ -9,24 +9,26 @@ from lmdsl.common.types import Floats
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.optimize.feasibility.gamma_bar import GammaBar
+from lmdsl.problem.problem import Problem
 
 
 def refusal_message(
-    lp: StabilizationLP, w: Floats, limits: GammaBar, bracket: tuple[float, float]
+    problem: Problem, inside: int, cells: Area, limiting: Area | None, bracket: tuple[float, float]
 ) -> str:
-    """Return the sentence that refuses a gamma: the bracket, the cells, and what can be done."""
-    cells = Area.of(lp.partition, lp.cells[w > 0])
-    left = lp.n - len(cells)
+    """Return the sentence that refuses a gamma: the bracket, the cells, and what can be done.
+
+    ``inside`` is the number of cells of C, ``cells`` those that are infeasible, ``limiting`` those
+    of them that limit gamma_bar, if known.
+    """
+    left = inside - len(cells)
     parts = [
-        f"gamma = {lp.gamma!r} is not below gamma_bar, which lies in "
+        f"gamma = {problem.gamma!r} is not below gamma_bar, which lies in "
         f"[{bracket[0]:.9g}, {bracket[1]:.9g}]: proved that no control makes the cost finite from "
         f"{_counted(cells)}"
     ]
-    limiting = limits.limiting
     if limiting is not None and len(limiting) != len(cells):
         parts.append(f"gamma_bar is limited by {_counted(limiting)}")
-    if left and lp.problem.successors != "enclosed":
+    if left and problem.successors != "enclosed":
         parts.append(
             "this corner limits gamma_bar for all; lower gamma, or solve on the other "
             f"{left} cells with --restrict-to-gamma (restrict_to_gamma=True)"

@@ -1,0 +1,69 @@
+"""A bracket of gamma_bar over ranks, for models that no rank can hold.
+
+low     the largest gamma at which a policy was proved stabilizing while gamma was raised
+high    the least one at which passes leave a vector w >= 0 with w <= high P_a w for every pair
+
+Both are proved, but the bracket is as wide as that; rank 0 alone closes it where it holds the model
+(``gamma/whole.py``).
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from lmdsl.certificate import bounds
+from lmdsl.common.types import Floats, Policy, TimeUp
+from lmdsl.model.lp import StabilizationLP
+from lmdsl.optimize.descent import backup_below
+from lmdsl.ranks.reading import Read
+from lmdsl.slabs import beginning
+from lmdsl.slabs.chains.first import First
+from lmdsl.slabs.gamma import refusing
+
+WIDTH, PROBES = 1e-3, 12  # relative width aimed at, and number of gammas asked for it
+
+
+def bracket(lp: StabilizationLP, w: Floats, gathered: int, time_up: TimeUp) -> tuple[float, float]:
+    """Return proved bounds of gamma_bar from a refusal of the gamma of a model; collective."""
+    low = 0.0
+    for at, policy, V in beginning.climbing(lp, gathered, time_up):
+        gain = at > low * (1 + WIDTH / 4)
+        if proves_low(lp, policy, V, at):
+            low = max(low, at)
+        if not gain and low > 1:
+            break
+    high = min(least_high(lp, w), lp.gamma)
+    for _ in range(PROBES):
+        if high <= low * (1 + WIDTH) or low <= 1 or time_up():
+            break
+        between = math.sqrt(low * high)
+        found = refusing.refusal(replace(lp, gamma=between, _known=lp._algorithm_1), time_up)
+        if found is None:
+            break
+        high = min(high, least_high(lp, found), between)
+    return low, high
+
+
+def proves_low(lp: StabilizationLP, policy: Policy, w: Floats, low: float) -> bool:
+    """Return whether w > 0 and low P_u w < w for a policy, read by number; collective."""
+    ranks = First(lp).mesh.ranks
+    if not ranks.all(bool((np.isfinite(w) & (w > 0)).all())):
+        return False
+    return ranks.all(bounds.decrease(_read(lp), policy, w, low) is not None)
+
+
+def least_high(lp: StabilizationLP, w: Floats) -> float:
+    """Return the least high (rounded up) with w <= high P_a w for all pairs; collective.
+
+    Like a claim it reads values by number, by no plan of those who made w.
+    """
+    ahead = backup_below(_read(lp), w, 1.0, np.zeros(lp.K))
+    on = w > 0
+    with np.errstate(divide="ignore"):
+        own = float((w[on] / ahead[on]).max(initial=0.0)) if (ahead[on] > 0).all() else math.inf
+    return max(First(lp).mesh.ranks.collect(own)) * (1 + 4 * bounds.UNIT)
+
+
+def _read(lp: StabilizationLP) -> StabilizationLP:
+    return replace(lp, mesh=Read.again(First(lp).mesh))
