@@ -24,7 +24,7 @@ from lmdsl.model.local import holding
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.sets import attractor_note
 from lmdsl.model.stabilizable_set import CellStatus, sets_of
-from lmdsl.optimize.feasibility.restriction import refusal_message
+from lmdsl.optimize.feasibility.restriction import refusal_of_cells
 from lmdsl.problem.problem import Problem
 from lmdsl.ranks.verbs import Alone, Item, RankError, Ranks
 from lmdsl.results.job import Extent, left_out, success, together
@@ -127,7 +127,7 @@ class AnswerMaker:
         area = self._area(w > 0)
         assert area is not None
         lp = self.lp
-        message = refusal_message(lp.problem, self.extent.inside, area, None, limits)
+        message = refusal_of_cells(lp.problem, self.extent.inside, area, None, limits)
         proof = replace(found.certificate, reasons=(message,))
         return self._made(found.witness, proof, Status.NOT_STABILIZABLE, message,
                           cause=Cause.GAMMA, gamma_bar=limits, area=area)  # fmt: skip

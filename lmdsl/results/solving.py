@@ -22,7 +22,6 @@ from lmdsl.common.types import FilePath, Floats, Indices, Progress, told
 from lmdsl.errors import BadInput, shown
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.model.grid.boxes import Area
 from lmdsl.model.lp import StabilizationLP, compile
 from lmdsl.optimize import checkpoints
 from lmdsl.optimize.feasibility import first_policy, gamma_bar, lifting, restriction
@@ -241,8 +240,7 @@ def _infeasible(
     job.solve_seconds, job.finish = time.perf_counter() - started, request.deadline.again()
     limits = gamma_bar.bracket(lp, request.deadline, start=first.best)
     bracket = (max(limits.low, first.lower), min(limits.high, lp.gamma))
-    cells = Area.of(lp.partition, lp.cells[w > 0])
-    message = restriction.refusal_message(lp.problem, lp.n, cells, limits.limiting, bracket)
+    message = restriction.refusal_message(lp, w, limits, bracket)
     return job.refused(Cause.GAMMA, message, verified, bracket)
 
 

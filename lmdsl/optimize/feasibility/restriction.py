@@ -9,10 +9,19 @@ from lmdsl.common.types import Floats
 from lmdsl.model.grid.boxes import Area
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
+from lmdsl.optimize.feasibility.gamma_bar import GammaBar
 from lmdsl.problem.problem import Problem
 
 
 def refusal_message(
+    lp: StabilizationLP, w: Floats, limits: GammaBar, bracket: tuple[float, float]
+) -> str:
+    """Return the sentence that refuses a gamma: the bracket, the cells, and what can be done."""
+    cells = Area.of(lp.partition, lp.cells[w > 0])
+    return refusal_of_cells(lp.problem, lp.n, cells, limits.limiting, bracket)
+
+
+def refusal_of_cells(
     problem: Problem, inside: int, cells: Area, limiting: Area | None, bracket: tuple[float, float]
 ) -> str:
     """Return the sentence that refuses a gamma: the bracket, the cells, and what can be done.
