@@ -21,6 +21,7 @@ SHARED: dict[str, dict[str, Any]] = {
     "file": {"metavar": "FILE", "help": "problem file, or a result directory: its problem"},
     "dir": {"metavar": "DIR", "help": "result directory"},
     "--time-limit": {"type": float, "metavar": "S", "help": "seconds"},
+    "--rows-on-disk": {"metavar": "DIR", "help": "keep rows in files of DIR instead of memory"},
     "--json": {"action": "store_true", "help": "print one JSON object on stdout"},
 }
 

@@ -131,7 +131,7 @@ def _verify(ranks: Ranks, parsed: Arguments) -> int:
     with ProgressLine() as progress:
         found = verify(
             parsed.dir, exact=parsed.exact, progress=progress, time_limit=parsed.time_limit,
-            ranks=ranks,
+            rows_on_disk=parsed.rows_on_disk, ranks=ranks,
         )  # fmt: skip
     answer(parsed, found)
     return 0 if found.holds else 1

@@ -24,7 +24,7 @@ def add(command: Command) -> None:
     shared(verify, "dir")
     verify.add_argument("--exact", action="store_true",
                         help="judge in rational arithmetic, without tolerance")  # fmt: skip
-    shared(verify, "--time-limit", "--json")
+    shared(verify, "--time-limit", "--rows-on-disk", "--json")
 
     _add_simulate(command)
 
@@ -88,8 +88,9 @@ def _verify(parsed: Arguments) -> int:
 
     with ProgressLine() as progress:
         found = verify(
-            parsed.dir, exact=parsed.exact, progress=progress, time_limit=parsed.time_limit
-        )
+            parsed.dir, exact=parsed.exact, progress=progress, time_limit=parsed.time_limit,
+            rows_on_disk=parsed.rows_on_disk,
+        )  # fmt: skip
     answer(parsed, found)
     return 0 if found.holds else 1
 

@@ -55,8 +55,7 @@ def add(command: Command) -> None:
                        help="keep the policy at hand in DIR every minute")  # fmt: skip
     solve.add_argument("--resume", metavar="DIR",
                        help="begin with the policy that was kept in DIR")  # fmt: skip
-    solve.add_argument("--rows-on-disk", metavar="DIR",
-                       help="keep the rows in files of DIR instead of memory")  # fmt: skip
+    shared(solve, "--rows-on-disk")
     solve.add_argument("--out", metavar="DIR", help="write controller and certificate to DIR")
     solve.add_argument("--no-simulate", dest="simulate", action="store_false",
                        help="make no runs of the true map")  # fmt: skip

@@ -62,7 +62,7 @@ class Disk:
     def require(self, count: float) -> None:
         """Refuse work whose rows exceed what is free in the folder, before any of it is done."""
         try:
-            free = shutil.disk_usage(self.path).free
+            free = shutil.disk_usage(self.path).free // memory.processes()
         except OSError as error:
             raise self.refusal(error) from None
         if count > free:

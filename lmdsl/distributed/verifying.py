@@ -9,13 +9,13 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.common import inputs
-from lmdsl.common.types import Progress, told
+from lmdsl.common.on_disk import Disk
+from lmdsl.common.types import FilePath, Progress, told
 from lmdsl.distributed.making import AnswerMaker
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.surroundings import own_arithmetic
@@ -43,6 +43,7 @@ def verify(
     exact: bool = False,
     progress: Progress | bool | None = None,
     time_limit: float | None = None,
+    rows_on_disk: FilePath | None = None,
     ranks: Ranks | None = None,
 ) -> Verification:
     """Recompile the problem of a result directory over ranks and check every claim it makes.
@@ -51,7 +52,7 @@ def verify(
     ----------
     path
         The result directory, which all ranks see.
-    exact, time_limit
+    exact, time_limit, rows_on_disk
         As for :func:`lmdsl.verify`.
     progress
         Of rank 0: called with (stage, fraction done) during long work; True shows it on stderr.
@@ -79,9 +80,13 @@ def verify(
         if exactly or _needs_all(ranks, stored):
             return by_first(
                 ranks,
-                lambda: verify_alone(path, exact=exactly, progress=heard, time_limit=deadline),
-            )
-        return _verified(ranks, Path(path), stored, deadline)
+                lambda: verify_alone(
+                    path, exact=exactly, progress=heard, time_limit=deadline,
+                    rows_on_disk=rows_on_disk,
+                ),
+            )  # fmt: skip
+        disk = ranks.agreed(lambda: Disk.of(rows_on_disk))
+        return _verified(ranks, stored, deadline, disk)
 
     return together(everyone, program)
 
@@ -109,9 +114,11 @@ def _needs_all(ranks: Ranks, stored: archive.Stored) -> bool:
     )  # fmt: skip
 
 
-def _verified(ranks: Ranks, path: Path, stored: archive.Stored, deadline: Deadline) -> Verification:
+def _verified(
+    ranks: Ranks, stored: archive.Stored, deadline: Deadline, disk: Disk | None
+) -> Verification:
     result = stored.result
-    lp = compiling.compiled(ranks, result.problem, deadline)
+    lp = compiling.compiled(ranks, result.problem, deadline, disk)
     maker = AnswerMaker(ranks, result.problem, result.tolerance or 0.0, deadline)
     maker.of_model(lp)
     first, last = (int(n) for n in maker.starts[ranks.rank : ranks.rank + 2])

@@ -19,6 +19,20 @@ UNKNOWN = 8 * 2**30  # where the operating system does not say
 UNLIMITED = 2**60  # version 1 writes its largest number of pages
 
 
+_processes = 1  # that work together on this machine, each with a part of what is free
+
+
+def share(processes: int) -> None:
+    """Count with a part of what is free on the machine from here on: so many processes use it."""
+    global _processes
+    _processes = max(1, processes)
+
+
+def processes() -> int:
+    """Return how many processes work together on this machine."""
+    return _processes
+
+
 class Memory(NamedTuple):
     """Bytes that may still be used, and what says so."""
 
@@ -28,8 +42,9 @@ class Memory(NamedTuple):
 
 def available(root: Path = Path("/"), environ: Mapping[str, str] = os.environ) -> Memory:
     """Return the tightest limit; ``root`` holds ``proc`` and ``sys``, ``environ`` names Slurm."""
-    limits = [_free(root), *_groups(root), *_ulimits(root), *_slurm(root, environ)]
-    least = min(limits)
+    of_all = [_free(root), *_groups(root), *_slurm(root, environ)]
+    parts = [Memory(each.bytes // _processes, each.limit) for each in of_all]
+    least = min([*parts, *_ulimits(root)])
     return Memory(max(least.bytes, 0), least.limit)
 
 

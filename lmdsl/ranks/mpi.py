@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.errors import MissingDependency
-from lmdsl.machine import threads
+from lmdsl.machine import memory, threads
 from lmdsl.ranks.launchers import launched
 from lmdsl.ranks.verbs import Alone, Item, RankError, Ranks, require_expected
 
@@ -187,8 +187,9 @@ def at_hand() -> Ranks:
 
 
 def _share_processors(ranks: MpiRanks) -> None:
-    """Let ranks that may use the same processors use each a share of them."""
+    """Let ranks of a machine, or of the same processors, use each a share of what they share."""
     processors = threads.processors()
     here = socket.gethostname(), processors
-    sharing = ranks.world.allgather(here).count(here)
-    threads.limit(len(processors) // sharing)
+    every = ranks.world.allgather(here)
+    threads.limit(len(processors) // every.count(here))
+    memory.share(sum(name == here[0] for name, _ in every))

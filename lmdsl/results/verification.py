@@ -16,13 +16,13 @@ from lmdsl.certificate.exact_sums import BLOCK
 from lmdsl.certificate.judge import exact_verdict, verdict
 from lmdsl.common import inputs
 from lmdsl.common.records import Reported, jsonable
-from lmdsl.common.types import Progress, told
+from lmdsl.common.types import FilePath, Progress, told
 from lmdsl.errors import BadInput, printable
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.progress import Counted
 from lmdsl.machine.surroundings import own_arithmetic
-from lmdsl.model.assembly.estimates import estimate
+from lmdsl.model.assembly.estimates import estimate, refuse_given
 from lmdsl.model.assembly.transitions import shares_of
 from lmdsl.model.discretization import noise_nodes, sample_points
 from lmdsl.model.local import holding
@@ -113,7 +113,7 @@ class Verification(Reported):
 @own_arithmetic
 def verify(
     path: str | os.PathLike[str], *, exact: bool = False, progress: Progress | bool | None = None,
-    time_limit: float | Deadline | None = None,
+    time_limit: float | Deadline | None = None, rows_on_disk: FilePath | None = None,
 ) -> Verification:  # fmt: skip
     """Recompile the problem of a result directory and check every claim it makes.
 
@@ -127,6 +127,8 @@ def verify(
         Called with (stage, fraction done) during long work; True shows it on stderr.
     time_limit
         Seconds.
+    rows_on_disk
+        A folder: the rows that are made anew lie there instead of in memory.
 
     Raises
     ------
@@ -146,7 +148,7 @@ def verify(
         f"{name} was written anew since the save; what it holds now was judged"
         for name in stored.rewritten
     ]
-    lp = whole = recompiled(path, result, progress, deadline)
+    lp = whole = recompiled(path, result, progress, deadline, rows_on_disk)
     in_time()
     if progress:  # told at once, and where an exact judge reads blocks of rows
         counted = Counted(in_time, progress, -(-lp.n // BLOCK) - (-lp.K // BLOCK))
@@ -170,7 +172,7 @@ def verify(
     in_time()
     reasons += local_differences(lp, result, stored.certificate, deadline)
     reasons += proof_findings(path, result, stored.certificate.proof, in_time, notes)
-    declared = partial(compile, result.problem, progress, deadline)
+    declared = partial(compile, result.problem, progress, deadline, rows_on_disk=rows_on_disk)
     reasons += repaired.differences(result, stored.certificate.proof, declared, lp, judge, deadline)
     said = tuple(reasons), tuple(notes)
     found = Verification(not reasons, result.status, same, certificate, *said)
@@ -193,15 +195,16 @@ def _restricted(
 
 def recompiled(
     path: str | os.PathLike[str], result: Result, progress: Progress | None = None,
-    time_limit: float | Deadline | None = None,
+    time_limit: float | Deadline | None = None, rows_on_disk: FilePath | None = None,
 ) -> StabilizationLP:  # fmt: skip
     """Return the finite model of a directory made anew; of Python functions, what they gave."""
-    problem = result.problem
+    problem, made = result.problem, partial(compile, rows_on_disk=rows_on_disk)
     if "system" in problem.functions:
+        refuse_given(rows_on_disk)
         return _stored_model(path, result)
     if not problem.functions:
-        return compile(problem, progress, time_limit, dropped=result.dropped)
-    lp = compile(problem.replaced(stage_cost="0"), progress, time_limit)
+        return made(problem, progress, time_limit, dropped=result.dropped)
+    lp = made(problem.replaced(stage_cost="0"), progress, time_limit)
     cost = archive.read_model(path, result, {"cost": ((lp.K,), "<f8")})["cost"]
     if not (np.isfinite(cost) & (cost >= 0)).all():
         raise BadInput("the saved costs are inconsistent", "model.npz")
@@ -255,16 +258,9 @@ def _stored_model(path: str | os.PathLike[str], result: Result) -> Stabilization
     n, K = len(cells), int(result.pairs or 0)
     memory.require(estimate(problem), "the saved rows")
     nodes, points = noise_nodes(problem), sample_points(problem)
-    small = archive.read_model(
-        path,
-        result,
-        {
-            "pair_pointer": ((n + 1,), "<i8"),
-            "control": ((K,), "<i4"),
-            "pointer": ((K + 1,), "<i8"),
-            "cost": ((K,), "<f8"),
-        },
-    )
+    kinds = {"pair_pointer": ((n + 1,), "<i8"), "control": ((K,), "<i4"),
+             "pointer": ((K + 1,), "<i8"), "cost": ((K,), "<f8")}  # fmt: skip
+    small = archive.read_model(path, result, kinds)
     entries = int(small["pointer"][-1])
     if not 0 <= entries <= K * (points * len(nodes.weights) + 1):
         raise BadInput("pointer is out of range", "model.npz")

@@ -168,7 +168,7 @@ def test_a_problem_that_fits_with_rows_on_disk_alone_is_told_so(tmp_path, monkey
     words = str(refused.value)
     assert "(a test); use fewer cells, controls, sample points or noise nodes, or keep" in words
     now = f"{memory.human(least[1])} of memory and {memory.human(of_rows(problem))} there"
-    assert "rows on disk (lmdsl solve --rows-on-disk DIR, in Python rows_on_disk=DIR)" in words
+    assert "rows on disk (--rows-on-disk DIR, in Python rows_on_disk=DIR)" in words
     assert words.endswith(f", which takes {now}")
     assert lm.solve(problem, rows_on_disk=tmp_path).verified
     monkeypatch.setattr(memory, "available", lambda: memory.Memory(10**6, "a test"))
@@ -178,6 +178,49 @@ def test_a_problem_that_fits_with_rows_on_disk_alone_is_told_so(tmp_path, monkey
     with pytest.raises(lm.BadInput) as refused:
         lm.solve(problem)
     assert "--rows-on-disk" not in str(refused.value)  # what would not help
+
+
+def test_ranks_count_their_own_part_of_a_problem_and_of_a_machine(monkeypatch):
+    """One of four has room where one process has none; two on a machine have half of it each."""
+    problem, rows = made(standard_map(300)), Pilot(1.0, 8.0)
+    need = estimate(problem, rows, share=0.26)
+    assert need < 0.8 * estimate(problem, Pilot(1.0, 5.0))
+    assert 2 * of_rows(problem, rows, 0.25) == pytest.approx(of_rows(problem, rows, 0.5))
+    monkeypatch.setattr(memory, "available", lambda: memory.Memory(need, "a test"))
+    with pytest.raises(lm.BadInput, match="a test"):
+        lm.compile(problem)
+    as_threads(4, lambda ranks: compiling.compiled(ranks, problem))
+    monkeypatch.setattr(memory, "available", lambda: memory.Memory(need // 2, "a test"))
+    with pytest.raises(lm.BadInput, match=r"estimated from a few cells, on one of several ranks\)"):
+        as_threads(4, lambda ranks: compiling.compiled(ranks, problem))
+
+
+def test_processes_of_a_machine_share_what_is_free(tmp_path, monkeypatch):
+    (tmp_path / "proc").mkdir()
+    (tmp_path / "proc/meminfo").write_text("MemAvailable: 1000 kB\n")
+    monkeypatch.setattr(memory, "_processes", 1)
+    alone = memory.available(tmp_path, {})
+    memory.share(4)
+    assert memory.available(tmp_path, {}) == (alone.bytes // 4, "free memory")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(9, 0, 10))
+    Disk(tmp_path).require(2)
+    with pytest.raises(lm.BadInput, match="2 B are free"):
+        Disk(tmp_path).require(3)
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_a_result_is_verified_with_rows_on_disk(tmp_path, monkeypatch, count):
+    lm.solve(PROBLEMS["cells are lost"](), rows_on_disk=tmp_path / "rows").save(tmp_path / "out")
+    made_there, true = [], Disk.mapped
+    monkeypatch.setattr(Disk, "mapped", lambda *a: made_there.append(a) or true(*a))
+
+    def check(**ranks):
+        verify = lm.distributed.verify if ranks else lm.verify
+        return verify(tmp_path / "out", rows_on_disk=tmp_path / "rows", **ranks).holds
+
+    assert all(as_threads(count, lambda ranks: check(ranks=ranks)) if count else [check()])
+    assert made_there
+    assert os.listdir(tmp_path / "rows") == []
 
 
 @pytest.mark.parametrize("admissible", [1.0, 0.5])

@@ -36,14 +36,13 @@ def require_room(
     Where its rows on disk would make it fit, the refusal says so, and how much they take there.
     """
     pilot = pilot or ALL_ADMISSIBLE
-    need, rows = (int(each * share) for each in (estimate(problem, pilot, disk is not None),
-                                                 of_rows(problem, pilot)))  # fmt: skip
+    need, rows = estimate(problem, pilot, disk is not None, share), of_rows(problem, pilot, share)
+    how = named(problem, how) + ", on one of several ranks" * (share < 1)
     if disk is not None:
         disk.require(rows)
-        memory.require(need, f"{named(problem, how)}, rows on disk")
+        memory.require(need, f"{how}, rows on disk")
     else:
-        less = int(estimate(problem, pilot, True) * share)
-        memory.require(need, named(problem, how), _remedy(less, rows))
+        memory.require(need, how, _remedy(estimate(problem, pilot, True, share), rows))
     return need
 
 
@@ -52,12 +51,12 @@ def _remedy(need: int, rows: int) -> str:
     if not memory.fits(need):
         return ""
     return (
-        "or keep rows on disk (lmdsl solve --rows-on-disk DIR, in Python rows_on_disk=DIR), which "
+        "or keep rows on disk (--rows-on-disk DIR, in Python rows_on_disk=DIR), which "
         f"takes {memory.human(need)} of memory and {memory.human(rows)} there"
     )
 
 
-def refuse_given(disk: Disk | None) -> None:
+def refuse_given(disk: object) -> None:
     """Refuse a disk for rows that are given, in memory."""
     if disk is not None:
         raise BadInput(
@@ -83,18 +82,26 @@ class Pilot(NamedTuple):
 ALL_ADMISSIBLE = Pilot()
 
 
-def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE, on_disk: bool = False) -> int:
+def estimate(
+    problem: Problem,
+    pilot: Pilot = ALL_ADMISSIBLE,
+    on_disk: bool = False,
+    share: float = 1.0,
+) -> int:
     """Return an upper bound of the bytes of memory that compiling and solving a problem takes.
+
+    With rows ``on_disk``; of a process that has a ``share`` of the cells.
 
     Solving is counted for the default backend, as it goes as a rule. What takes more (cells that
     are lost, ties, other backends, a first policy that is hard to find) asks when it comes to it.
     """
-    N, M, S = _counts(problem)
+    every, M, S = _counts(problem)
+    N = every * share
     pairs = M * pilot.admissible
     entries = pilot.entries + (problem.discount is not None)
     # Of a pair the row, its end, control and cost; of a cell the sets, levels and weights.
     row = 0.0 if on_disk else 20 + entries * _entry(S)
-    model = N * (64 + pairs * (1 + row))
+    model = N * (64 + pairs * (1 + row)) + (every - N) * SETS
     if problem.successors == "enclosed":
         parts = min(discretization.node_count(problem), 10**40)
         model += N * pairs * (8 + 4 * parts * len(problem.state_box))
@@ -106,14 +113,14 @@ def estimate(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE, on_disk: bool = Fa
     return int(min(peak + _grids(problem, M, S) + OVERHEAD, 1e30))
 
 
-def of_rows(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE) -> int:
-    """Return an upper bound of the bytes that rows take on disk."""
+def of_rows(problem: Problem, pilot: Pilot = ALL_ADMISSIBLE, share: float = 1.0) -> int:
+    """Return an upper bound of the bytes that rows of a share of the cells take on disk."""
     N, M, S = _counts(problem)
     entries = pilot.entries + (problem.discount is not None)
     each = 20 + entries * _entry(S)
     if pilot.admissible < 1:  # cells may be lost: a copy, and who reaches each cell
         each += max(each + 8, 8 * entries)
-    return int(min(MARGIN * N * M * pilot.admissible * each, 1e30))
+    return int(min(MARGIN * share * N * M * pilot.admissible * each, 1e30))
 
 
 def _counts(problem: Problem) -> tuple[int, int, int]:
@@ -132,6 +139,9 @@ def _entry(S: int) -> int:
 
 
 MARGIN = 1.1  # a few cells do not say exactly what all are like, and allocators keep something back
+
+
+SETS = 24  # bytes of a cell of others: whether it is free, its number and mass
 
 
 OVERHEAD = 2**25  # bytes of code, kernels and tables

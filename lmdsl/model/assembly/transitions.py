@@ -75,7 +75,8 @@ def assemble(
     problem does not fit in memory, or the stage cost of an admissible pair is negative or not
     finite at a sample.
     """
-    require_least(problem, disk)
+    if span is None:  # else of a part, whose pairs are counted once a few cells are sampled
+        require_least(problem, disk)
     deadline = unless_short(problem, Deadline.of(deadline))
     sets = sets or CellSets.of(problem, partition, deadline)
     if isinstance(problem.system, MatrixSystem):
