@@ -98,10 +98,10 @@ def _avoid(problem: Problem, partition: Partition, guard: Guard) -> Bools:
 
 
 def _mass(problem: Problem, partition: Partition, guard: Guard) -> Floats:
-    mass = np.ones(partition.size)
     declared = problem.measure
     if declared is None:
-        return mass
+        return np.broadcast_to(1.0, partition.size)  # takes no memory
+    mass = np.ones(partition.size)
     density = problem.density()
     if declared.weights is not None:
         if len(declared.weights) != partition.size:

@@ -153,36 +153,47 @@ class ByAll:
         return self.lp.mesh
 
     def stable(
-        self, policy: Policy, guess: Floats | None, cost: Floats | None = None
+        self,
+        policy: Policy,
+        guess: Floats | None,
+        cost: Floats | None = None,
+        under: StabilizationLP | None = None,
     ) -> tuple[Floats, Floats] | None:
         """Return w > 0, d > 0 with w >= g P_u w + d; None where there is none in sight.
 
         It comes from a guess towards the value under unit cost, or another one that is positive.
+        ``under`` is the model under the policy, where it is at hand.
         """
         b = np.ones(self.lp.n) if cost is None else cost
         system = self.chain(policy, self.lp.growth)
         w = b.copy() if guess is None else np.maximum(guess, b)
         for _ in range(first_policy.MOST_ROUNDS):  # it need not be solved to the end
             change = system.advance(b, w, first_policy.SWEEPS, 1e-2 if cost is None else 0.0)
-            found = self.proof(policy, w) if change < np.inf else None
+            found = self.proof(policy, w, under) if change < np.inf else None
             if found is not None or not change > TOLERANCE or not change < np.inf:
                 break
         if found is not None or not change < np.inf:
             return found
         solved = system.solve(b, w, self.time_up)
-        return None if solved is None else self.proof(policy, solved)
+        return None if solved is None else self.proof(policy, solved, under)
 
-    def proof(self, policy: Policy, w: Floats) -> tuple[Floats, Floats] | None:
+    def proof(
+        self, policy: Policy, w: Floats, under: StabilizationLP | None = None
+    ) -> tuple[Floats, Floats] | None:
         """Return w with the d > 0 that it leaves, None where it leaves none."""
         ranks = self.mesh.ranks
         if not ranks.all(bool((np.isfinite(w) & (w > 0)).all())):  # else not all would ask on
             return None
-        d = bounds.decrease(self.lp, policy, w, self.lp.growth)
+        lp, columns = (self.lp, policy) if under is None else (under, np.arange(under.n))
+        d = bounds.decrease(lp, columns, w, lp.growth)
         return None if ranks.any(d is None) or d is None else (w, d)
 
     def bound(self, policy: Policy, guess: Floats | None) -> Floats | None:
         """Return V >= T_u V of a policy that is proved stabilizing, None where it is not."""
         cost, found = self.lp.cost[policy], None
+        even = self._even(policy, cost)
+        if even is not None:
+            return even
         if guess is not None and self.mesh.ranks.all(bool((cost > 0).all())):
             found = self.stable(policy, guess, cost)  # then V is close to the value
         found = found or self.stable(policy, guess)
@@ -194,9 +205,26 @@ class ByAll:
             V = w * (max(self.mesh.ranks.collect(own)) * (1 + 1e-12))
         return None if self.mesh.ranks.any(not (V < CEILING).all()) else V
 
+    def _even(self, policy: Policy, cost: Floats) -> Floats | None:
+        """Return a constant V >= T_u V within a percent of the value, None where none is."""
+        lp, ranks = self.lp, self.mesh.ranks
+        some = np.arange(0, lp.n, lp.n // iteration.PROBES + 1)  # few are looked at where none is
+        rows = lp.rows.take(policy[some])
+        share = np.where(rows.target < rows.columns, rows.shares.value[rows.code], 0.0)
+        stays = np.add.reduceat(share, rows.pointer[:-1]) if len(some) else share
+        if not ranks.all(bool((lp.growth * stays < 1).all())):
+            return None
+        found = self.proof(policy, np.ones(lp.n))
+        if found is None:
+            return None
+        ratio = cost / found[1]
+        factor = max(ranks.collect(float(ratio.max(initial=0.0)))) * (1 + 1e-12)
+        close = factor < CEILING and bool((factor * (1 - 1e-2) <= ratio).all())
+        return np.full(lp.n, factor) if ranks.all(close) else None
+
     def lower(self, policy: Policy, V: Floats, screen: Screen) -> tuple[Floats, bool]:
         """Return V after a few sweeps of the core, exact outside, and whether it is the value."""
-        x, cost = V.copy(), self.lp.cost[policy]
+        x, cost = V.copy(), screen.policy_cost
         change = self.chain(policy, self.lp.gamma, screen).advance(cost, x, FEW, 0.0)
         if not change < np.inf:
             return V, False
@@ -216,32 +244,34 @@ class ByAll:
     def witness(self, policy: Policy, V: Floats, tolerance: float) -> Witness:
         """Return the vectors of a policy's claims; V is its value."""
         lp, ranks = self.lp, self.mesh.ranks
-        w, d = self.stable(policy, None) or (None, None)
-        V_up = None if w is None or d is None else self._above(policy, V, w, d)
-        W = self._guessed(policy, V, tolerance)
+        under = lp.under(policy)  # its rows one after the other: they are read some ten times
+        w, d = self.stable(policy, None, under=under) or (None, None)
+        V_up = None if w is None or d is None else self._above(under, V, w, d)
+        W = self._guessed(under, V, tolerance)
+        del under
         W = below.lower_vector(lp, V, tolerance, self.time_up) if W is None else W
         flat = 1e-2 * MEASURE_TOLERANCE / sum(ranks.collect(lp.n))
         mu = self.chain(policy, lp.gamma).solve_transposed(lp.weight, self.time_up, flat)
         return Witness(policy, w, V_up, W, mu)
 
-    def _guessed(self, policy: Policy, V: Floats, tolerance: float) -> Floats | None:
+    def _guessed(self, under: StabilizationLP, V: Floats, tolerance: float) -> Floats | None:
         """Return (1 - eps) V as one process guesses it from a policy's own rows; rarely too small.
 
         Where it does not serve the judge says so.
         """
-        every = self.mesh.ranks.collect(bounds.worst_excess(self.lp.under(policy), V))
+        every = self.mesh.ranks.collect(bounds.worst_excess(under, V))
         eps = 2 * max(worst for worst, _ in every) + bounds.UNIT
         if any(infinite for _, infinite in every) or not eps < min(tolerance / 4, MOST_GUESSED):
             return None
         return V * (1 - eps)
 
-    def _above(self, policy: Policy, V: Floats, w: Floats, d: Floats) -> Floats | None:
+    def _above(self, under: StabilizationLP, V: Floats, w: Floats, d: Floats) -> Floats | None:
         """Return V + delta w that is an upper bound, as one process makes it."""
-        lp, ranks = self.lp, self.mesh.ranks
+        own = np.arange(under.n)
         for _ in range(4):
-            future = bounds.expected_above(lp, policy, V, lp.gamma)
-            residual = bounds.add_above(future, lp.cost[policy]) - V
-            share = max(ranks.collect(float((residual / d).max(initial=0.0))))
+            future = bounds.expected_above(under, own, V, under.gamma)
+            residual = bounds.add_above(future, under.cost) - V
+            share = max(self.mesh.ranks.collect(float((residual / d).max(initial=0.0))))
             if share <= 0:
                 break
             V = V + share * 1.01 * w

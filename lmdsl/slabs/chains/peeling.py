@@ -193,7 +193,7 @@ def _freed(halo: Halo, came: dict[int, NDArray[Any]], ways: NDArray[np.uint32]) 
         cells = known[places]
         ways[cells] -= np.uint32(1)
         free.append(cells[ways[cells] == 0])
-    return np.sort(np.concatenate([*free, np.empty(0, dtype=np.int64)]))
+    return free[0] if len(free) == 1 else np.sort(np.concatenate([*free, np.empty(0, np.int64)]))
 
 
 @kernel
