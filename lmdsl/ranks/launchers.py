@@ -3,6 +3,8 @@
 A process that is alone must never be taken for one of many, nor many for one. So a variable counts
 only where the launcher sets it for the ranks that it starts: ``sbatch`` and ``salloc``, say, set
 ``SLURM_NTASKS`` for a script that is one process; ``srun`` sets the number of tasks of its step.
+What a rank starts inherits the variables and is no rank: MPICH's launcher talks by a file
+descriptor, which is closed there.
 """
 
 import os
@@ -36,6 +38,8 @@ class Launched(NamedTuple):
 
 def launched() -> Launched:
     """Return what the launcher says of this process."""
+    if _closed(_number("PMI_FD")):
+        return Launched()
     for table, exact in ((LAUNCHED, True), (LOCAL, False)):
         for size, rank, beside in table:
             count, which = _number(size), _number(rank)
@@ -44,6 +48,13 @@ def launched() -> Launched:
             if count and known and needed:
                 return Launched(count, which or 0, exact)
     return Launched()
+
+
+def _closed(descriptor: int | None) -> bool:
+    try:
+        return descriptor is not None and os.fstat(descriptor) is None
+    except OSError:
+        return True
 
 
 def _number(name: str) -> int | None:

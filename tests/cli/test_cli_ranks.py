@@ -120,8 +120,13 @@ REFUSED = {
 }
 
 
+FEW = ("another backend", "no file", "compare", "usage")
+
+
 @needs_mpi
-@pytest.mark.parametrize("case", REFUSED)
+@pytest.mark.parametrize(
+    "case", [pytest.param(case, marks=[pytest.mark.full] * (case not in FEW)) for case in REFUSED]
+)
 def test_what_is_refused_is_said_once(file, case):
     arguments, message = REFUSED[case]
     done = over(2, *(file if text == "FILE" else text for text in arguments))

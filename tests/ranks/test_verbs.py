@@ -239,6 +239,7 @@ def alone(monkeypatch, **variables):
     for names in (*launchers.LAUNCHED, *launchers.LOCAL):
         for name in (*names[:2], *names[2]):
             monkeypatch.delenv(name, raising=False)
+    monkeypatch.delenv("PMI_FD", raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
 
@@ -262,6 +263,9 @@ def alone(monkeypatch, **variables):
         ({"SLURM_STEP_NUM_TASKS": "8", "SLURM_PROCID": "0", "SLURM_STEP_ID": "4294967290"},
          (1, 0, True)),
         ({"PMI_SIZE": "many"}, (1, 0, True)),
+        # started by a rank; and a rank
+        ({"PMI_SIZE": "3", "PMI_RANK": "2", "PMI_FD": "99999"}, (1, 0, True)),
+        ({"PMI_SIZE": "3", "PMI_RANK": "2", "PMI_FD": "0"}, (3, 2, True)),
     ],
 )  # fmt: skip
 def test_what_launchers_say(monkeypatch, variables, found):

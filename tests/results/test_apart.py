@@ -1,5 +1,6 @@
 """Directories whose vectors are files of their own, as ranks write them: the same, but mapped."""
 
+import json
 import os
 import shutil
 
@@ -146,3 +147,24 @@ def test_digests_of_blocks():
     two = sha256(held[: 2**20]).digest() + sha256(held[2**20 :]).digest()
     assert reading.digest_of("value.npy", held) == "blocks:" + sha256(two).hexdigest()
     assert reading.digest_of("problem.json", held) == sha256(held).hexdigest()
+
+
+def test_loading_takes_no_memory_for_vectors(saved, tmp_path):
+    """Of a million cells, 37 MB: what NumPy and Python allocate meanwhile."""
+    import tracemalloc
+
+    N, held = 10**6, {}
+    for name, kind in vectors.TYPES.items():
+        held[name] = content(np.zeros(N, kind), kind)
+    put_apart(saved, tmp_path / "out", **held)
+    place = tmp_path / "out/problem.json"
+    problem = json.loads(place.read_text())
+    for axis in problem["state_box"].values():
+        axis["cells"] = 1000
+    place.write_text(json.dumps(problem, indent=1))
+    tracemalloc.start()
+    result = lm.Result.load(tmp_path / "out")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(result.value) == N
+    assert peak < 4e6
