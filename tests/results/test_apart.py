@@ -170,4 +170,4 @@ def test_loading_takes_no_memory_for_vectors(saved, tmp_path):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert len(result.value) == N
-    assert peak < 4e6
+    assert peak < 20e6  # of which 16 MiB are what a small file may hold
