@@ -44,7 +44,8 @@ class Expectation(Reported):
     cells, controls, samples
         Number of cells, of control vectors, and of samples of a pair of both.
     admissible
-        Share of the pairs from which no sample leaves.
+        Share of the pairs from which no sample leaves; None where there are too many cells to say
+        which of them are free.
     coverage
         Share of the cells outside attractor and avoid that can be stabilized; None if unknown, or
         if there is no such cell.
@@ -54,7 +55,7 @@ class Expectation(Reported):
     memory, available
         Bytes that compiling and solving take, and that are left.
     seconds
-        Seconds that compiling takes, roughly.
+        Seconds that compiling takes, roughly; None where it was not tried, as above.
     coverage_coarser
         Of an estimate, the share on the next coarser grid; None if unknown.
     attractor_widened
@@ -67,12 +68,12 @@ class Expectation(Reported):
     cells: int
     controls: int
     samples: int
-    admissible: float
+    admissible: float | None
     coverage: float | None
     coverage_cells: dict[str, int] | None
     memory: int
     available: int
-    seconds: float
+    seconds: float | None
     coverage_coarser: float | None = None
     attractor_widened: bool = False
     coverage_at_most: float | None = None
@@ -81,7 +82,7 @@ class Expectation(Reported):
         """Return sentences; ``own`` are the problem's own cells of each axis."""
         lines = [
             f"{self.cells:,} cells, {self.controls:,} controls, {self.samples:,} samples of each "
-            f"pair; {100 * self.admissible:.3g} % of the pairs tried are admissible"
+            f"pair{self._tried()}"
         ]
         if self.coverage is None and self.coverage_cells == own:
             lines.append("coverage: no cell lies outside attractor and avoid")
@@ -92,11 +93,16 @@ class Expectation(Reported):
         else:
             lines.append(f"coverage: about {100 * self.coverage:.3g} % can be stabilized, an "
                          f"estimate on {shape(self.coverage_cells)}{self._beside()}")  # fmt: skip
-        lines.append(
-            f"memory: about {memory.human(self.memory)} of {memory.human(self.available)}; "
-            f"compiling takes about {_seconds(self.seconds)}"
-        )
+        time = "how long compiling so many cells takes is not known before"
+        if self.seconds is not None:
+            time = f"compiling takes about {_seconds(self.seconds)}"
+        room = f"about {memory.human(self.memory)} of {memory.human(self.available)}"
+        lines.append(f"memory: {room}; {time}")
         return lines
+
+    def _tried(self) -> str:
+        share = self.admissible
+        return "" if share is None else f"; {100 * share:.3g} % of the pairs tried are admissible"
 
     def _most(self) -> str:
         if self.coverage_at_most is None:

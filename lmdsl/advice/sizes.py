@@ -134,7 +134,8 @@ def expected(survey: Survey, known: list[Level]) -> Expectation:
     """Return what compiling takes and gives."""
     problem, p = survey.problem, survey.partition
     own = {name: axis.cells for name, axis in problem.state_box.items()}
-    few, each, most = estimates.Pilot(), 0.0, None
+    few, most = estimates.ALL_ADMISSIBLE, None
+    each = None if survey.sets is None else 0.0
     if survey.sets is not None and len(survey.sets.free):
         sampler = Sampler(problem, p, sets=survey.sets)
         few, each, most = _few(sampler, survey, survey.sets)
@@ -143,12 +144,12 @@ def expected(survey: Survey, known: list[Level]) -> Expectation:
         cells=p.size,
         controls=discretization.control_count(problem),
         samples=discretization.sample_points(problem) * discretization.node_count(problem),
-        admissible=few.admissible,
+        admissible=None if each is None else few.admissible,
         coverage=level.found.share if level and level.found.free else None,
         coverage_cells=None if level is None else level.cells,
         memory=estimates.estimate(problem, few),
         available=memory.available().bytes,
-        seconds=each * p.size * discretization.control_count(problem),
+        seconds=None if each is None else each * p.size * discretization.control_count(problem),
         coverage_coarser=None if coarser is None else coarser.found.share,
         attractor_widened=level is not None and level.widened,
         coverage_at_most=most if level is None else None,

@@ -264,6 +264,10 @@ def test_large_problems_are_checked_on_fewer_cells(cells):
     report = lm.check(made(data))
     assert report.expected.cells == cells**2
     assert report.expected.coverage is None or report.expected.coverage_cells["th"] < cells
+    # Of so many cells not even the free ones are found: nothing is said of what was not tried.
+    untried = cells == 40_000
+    assert (report.expected.seconds is None) == (report.expected.admissible is None) == untried
+    assert ("how long compiling so many cells takes is not known" in str(report)) == untried
     codes = [finding.code for finding in report.findings]
     assert ("memory" in codes) == (report.expected.memory > report.expected.available)
 
