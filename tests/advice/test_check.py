@@ -37,7 +37,7 @@ def test_shipped_problems_look_right(name):
     assert not lm.check(lm.load(f"examples/{name}.json"))
 
 
-LARGER = ["double_integrator", "lorenz", "pendulum_on_cart"]
+LARGER = ["cart_pole", "double_integrator", "lorenz", "pendulum_on_cart"]
 
 
 def test_every_shipped_problem_is_looked_at():
