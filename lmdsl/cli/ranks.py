@@ -16,7 +16,7 @@ from lmdsl.cli.output import Arguments, ProgressLine, answer, narrated, print_js
 from lmdsl.cli.results import tell_runs
 from lmdsl.cli.solving import SECONDS, STARTS, STEPS, problem_asked, summary
 from lmdsl.cli.streams import kept, muted, say
-from lmdsl.errors import BadInput, MissingDependency, plain_text, printable
+from lmdsl.errors import BadInput, LmdslError, MissingDependency, plain_text, printable
 from lmdsl.ranks.ending import together
 from lmdsl.ranks.launchers import Launched
 from lmdsl.ranks.mpi import at_hand
@@ -108,14 +108,13 @@ def _solve(ranks: Ranks, parsed: Arguments) -> int:
         found = solving.solved(ranks, problem, wanted, progress if ranks.rank == 0 else None)
     if not parsed.json:  # reported first: whatever saving meets, the answer was given
         say(summary(found))
-    status, result = int(found.exit_status), found
+    status, result, saved = int(found.exit_status), found, False
     try:
         if parsed.out is not None and found.model_sha256:  # else no time to compile
-            saving.save(ranks, found, parsed.out)
-            if not parsed.json:
-                say(f"written to {printable(parsed.out)}")
+            saved = _saved(ranks, found, parsed)
+            status = status if saved else 2
         if parsed.simulate and found.model_sha256:
-            result = _with_runs(ranks, found, parsed, parsed.out is not None)
+            result = _with_runs(ranks, found, parsed, saved)
     finally:
         if parsed.json:
             print_json(result.to_dict())
@@ -123,6 +122,23 @@ def _solve(ranks: Ranks, parsed: Arguments) -> int:
         word = "verified" if found.verified else "not verified"
         say(f"{word} on the finite model; {result.simulation.sentence()}")
     return status
+
+
+def _saved(ranks: Ranks, found: Any, parsed: Arguments) -> bool:
+    """Save an answer; return whether that was possible: what is known is known all the same."""
+    from lmdsl.distributed import saving
+
+    try:
+        saving.save(ranks, found, parsed.out)
+    except (LmdslError, MemoryError) as error:
+        if not getattr(error, "agreed", False):
+            raise
+        text = f"lmdsl: {str(error) or 'out of memory'}; nothing was saved"
+        print(printable(text), file=sys.stderr)
+        return False
+    if not parsed.json:
+        say(f"written to {printable(parsed.out)}")
+    return True
 
 
 def _verify(ranks: Ranks, parsed: Arguments) -> int:

@@ -68,6 +68,18 @@ def test_an_error_of_one_rank_is_said_once_and_leaves_nothing(tmp_path, fault, s
 
 
 @needs_mpi
+@pytest.mark.long
+def test_what_was_found_is_told_where_it_cannot_be_saved(tmp_path):
+    """As one process does: one object, with what is known."""
+    code, said, out = ended(
+        started(tmp_path, "saving:full", "--out", tmp_path / "out", "--json")
+    )  # fmt: skip
+    assert code == 2
+    assert said == [each for each in said if each.endswith("; nothing was saved")]
+    assert json.loads(out)["status"] == "verified"
+
+
+@needs_mpi
 @pytest.mark.parametrize("place", ["solving", pytest.param("saving", marks=pytest.mark.long)])
 def test_a_killed_rank_ends_all(tmp_path, place):
     """What it leaves beside the directory is removed by the next save."""
