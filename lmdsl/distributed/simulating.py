@@ -170,8 +170,13 @@ class DividedSteps:
         return self.whole.method
 
     def move(self, values: Mapping[str, Floats], guard: Guard, absorb: bool, pieces: int) -> Moved:
-        """See :meth:`lmdsl.control.steps.Steps.move`; collective."""
+        """See :meth:`lmdsl.control.steps.Steps.move`; collective.
+
+        Few runs are moved by every rank alike: that takes less than to ask each other.
+        """
         count = max(len(x) for x in values.values() if np.ndim(x))
+        if count <= ALIGNED:
+            return self.whole.move(values, lambda: None, absorb, pieces)
         words = -(-count // ALIGNED)
         cuts = [min(count, ALIGNED * (words * k // self.ranks.count))
                 for k in range(self.ranks.count + 1)]  # fmt: skip
