@@ -12,7 +12,7 @@ from lmdsl.ranks.launchers import launched
 
 PATIENCE = 5.0  # seconds that an interrupted command has to end by itself
 
-_ended = False
+_ended = _interrupted = False
 
 
 def run() -> int:
@@ -30,7 +30,9 @@ def run() -> int:
         from lmdsl.cli import main
 
         return main()
-    except KeyboardInterrupt:  # before main() could take care of it
+    except BaseException as error:  # before main() could take care of it
+        if not (_interrupted or isinstance(error, KeyboardInterrupt)):
+            raise  # else what an import makes of it that is broken off
         _say_interrupted()
         return 130
     finally:
@@ -40,6 +42,8 @@ def run() -> int:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    global _interrupted
+    _interrupted = True
     _thread.start_new_thread(_end, ())  # not one of threading's: these take locks
     signal.default_int_handler(number, frame)
 

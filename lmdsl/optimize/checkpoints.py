@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common import arrays, inputs
-from lmdsl.common.files import open_regular, parsed, read_bytes, reason, write_whole
+from lmdsl.common.files import open_regular, parsed, read_bytes, reason, synced, write_whole
 from lmdsl.common.types import Floats
 from lmdsl.errors import BadInput, shown
 from lmdsl.model.lp import StabilizationLP
@@ -135,8 +135,7 @@ class Checkpoints:
             with open(self._place(name, save), "r+b") as file:
                 file.seek(len(arrays.header((N,), kind)) + first * np.dtype(kind).itemsize)
                 file.write(np.ascontiguousarray(own[name], dtype=kind).data)
-                file.flush()
-                os.fsync(file.fileno())
+                synced(file)
 
     def _commit(self, save: str, N: int, M: int) -> None:
         from lmdsl import __version__

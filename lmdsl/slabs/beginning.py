@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from lmdsl.common.on_disk import filled
 from lmdsl.common.types import Floats, Policy, TimeUp
 from lmdsl.machine.deadline import Stopped
 from lmdsl.model.lp import StabilizationLP
@@ -92,4 +93,4 @@ def climbing(
 
 def _unit(lp: StabilizationLP, gamma: float) -> StabilizationLP:
     """Return the model under unit cost and another gamma."""
-    return replace(lp, gamma=gamma, cost=np.ones(lp.K), _known=lp._algorithm_1)
+    return replace(lp, gamma=gamma, cost=filled(lp.cost, 1.0), _known=lp._algorithm_1)
