@@ -96,11 +96,11 @@ def over_ranks(
     mark("solve")
     with _told_before_verification(mark):
         found = solving.solved(lp, gathered=0 if everybody else MOST_GATHERED)
+    facts = {"cells": lp.n, "pairs": lp.K, "ghosts": len(lp.mesh.ghosts) if lp.mesh else 0}
     if found is None:
-        return {"cells": lp.n, "status": "undecided", "cost": None}
+        return {**facts, "status": "undecided", "cost": None}
     proof = found.certificate
-    word = "verified" if proof.verified else "unverified"
-    return {"cells": lp.n, "status": word, "cost": proof.cost}
+    return {**facts, "status": "verified" if proof.verified else "unverified", "cost": proof.cost}
 
 
 @contextlib.contextmanager

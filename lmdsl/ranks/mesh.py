@@ -179,7 +179,9 @@ class Mesh:
         The owner of every ghost is asked for it by its global number, and answers for its own.
         """
         self.plans += 1
-        chosen = np.unique(np.asarray(chosen, dtype=np.int64))
+        marked = np.zeros(len(self.ghosts), dtype=np.bool_)
+        marked[chosen] = True
+        chosen = np.flatnonzero(marked)
         wanted = self.ghosts[chosen]
         slots = (chosen + self.own).astype(np.int64, copy=False)
         owned = self.division.by_owner(wanted)
