@@ -29,13 +29,22 @@ class ByCell(NamedTuple):
     array: NDArray[Any]
     kind: str  # as what its entries count
     start: Indices | None = None  # where each own cell begins, and the end; None: one entry each
+    meant: NDArray[Any] | None = None  # what stands for each value of the array
+    steps: bool = False  # whether the array, one entry longer, holds ends: its differences count
 
 
 def digest(ranks: Ranks, division: Division, header: bytes, streams: Sequence[ByCell]) -> str:
     """Return the SHA-256 of streams by cell, the same on every rank; collective."""
     first, last = division.own(ranks.rank)
     cut = [first, *range((first // BLOCK + 1) * BLOCK, last, BLOCK), last] if last > first else []
-    parts = {a // BLOCK: _part(streams, a - first, b - first) for a, b in itertools.pairwise(cut)}
+    parts: dict[int, list[bytes]] = {}  # of blocks that may be shared with other ranks
+    hashes: dict[int, bytes] = {}
+    for a, b in itertools.pairwise(cut):
+        part = _part(streams, a - first, b - first)
+        if a % BLOCK or b == last:
+            parts[a // BLOCK] = part
+        else:
+            hashes[a // BLOCK] = _hash(part)
     away = {}
     if last > first and first % BLOCK:  # its first block begins with another rank's cell
         owner = int(division.owner(np.array([first - first % BLOCK]))[0])
@@ -46,8 +55,8 @@ def digest(ranks: Ranks, division: Division, header: bytes, streams: Sequence[By
         parts[block] = [
             mine + more for mine, more in zip(parts[block], _unpacked(came), strict=True)
         ]
-    own = b"".join(_hash(parts[block]) for block in sorted(parts))
-    every = ranks.collect(own)
+    hashes |= {block: _hash(part) for block, part in parts.items()}
+    every = ranks.collect(b"".join(hashes[block] for block in sorted(hashes)))
     sizes = repr((division.cells, BLOCK, [stream.kind for stream in streams])).encode()
     return hashlib.sha256(TITLE + header + sizes + b"".join(every)).hexdigest()
 
@@ -61,7 +70,6 @@ def of_model(ranks: Ranks, lp: StabilizationLP) -> str:
     """
     rows, shares, mesh = lp.rows, lp.rows.shares, lp.mesh
     division = mesh.division if mesh else Division.cut(np.ones(lp.n, dtype=np.int64), 1)
-    target = mesh.numbers[rows.target] if mesh else rows.target
     below = [*shares.denominator] if shares.total is None else shares.total
     header = hashlib.sha256(repr((below, [*shares.numerator])).encode()).digest()
     header += np.array([lp.gamma], dtype="<f8").tobytes()
@@ -76,11 +84,11 @@ def of_model(ranks: Ranks, lp: StabilizationLP) -> str:
     entries = rows.pointer[lp.pair_pointer]
     return digest(ranks, division, header, (
         ByCell(lp.cells, "<i8"),
-        ByCell(np.diff(lp.pair_pointer), "<i8"),
+        ByCell(lp.pair_pointer, "<i8", steps=True),
         ByCell(lp.control, "<i4", lp.pair_pointer),
         ByCell(lp.cost, "<f8", lp.pair_pointer),
-        ByCell(np.diff(rows.pointer), "<i8", lp.pair_pointer),
-        ByCell(target, "<i8", entries),
+        ByCell(rows.pointer, "<i8", lp.pair_pointer, steps=True),
+        ByCell(rows.target, "<i8", entries, mesh.numbers if mesh else None),
         ByCell(rows.code, "<u4", entries),
         ByCell(lp.weight, "<f8"),
     ))  # fmt: skip
@@ -89,9 +97,11 @@ def of_model(ranks: Ranks, lp: StabilizationLP) -> str:
 def _part(streams: Sequence[ByCell], a: int, b: int) -> list[bytes]:
     """Return the bytes of the own cells a..b-1, by stream."""
     found = []
-    for array, kind, start in streams:
+    for array, kind, start, meant, steps in streams:
         i, k = (a, b) if start is None else (int(start[a]), int(start[b]))
-        found.append(np.ascontiguousarray(array[i:k], dtype=kind).tobytes())
+        values = np.diff(array[i : k + 1]) if steps else array[i:k]
+        values = values if meant is None else meant[values]
+        found.append(np.ascontiguousarray(values, dtype=kind).tobytes())
     return found
 
 

@@ -202,3 +202,17 @@ def test_a_bad_cost_is_named_as_one_process_names_it():
     with pytest.raises(lm.BadInput) as ranked:
         as_threads(3, lambda ranks: compiling.compiled(ranks, problem))
     assert str(ranked.value) == str(alone.value)
+
+
+def test_a_digest_takes_the_memory_of_a_block():
+    """Beside the model: no copy of its rows."""
+    import tracemalloc
+
+    lp = lm.compile(EXAMPLES / "standard_map.json")
+    of_model(Alone(), lp)
+    tracemalloc.start()
+    of_model(Alone(), lp)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    arrays = (lp.rows.target, lp.rows.code, lp.rows.pointer, lp.cost, lp.control)
+    assert peak < sum(array.nbytes for array in arrays)  # 1,024 of 2,496 cells, as long numbers
