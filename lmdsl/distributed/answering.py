@@ -6,6 +6,7 @@ gamma_bar does, is found by rank 0 with the code of one process, where the model
 """
 
 import time
+from pathlib import Path
 from typing import NamedTuple
 
 from lmdsl.common.on_disk import Disk
@@ -68,20 +69,20 @@ def answer(
     wanted = wanted or Wanted()
     deadline, started = Deadline.of(wanted.time_limit), time.perf_counter()
     maker = AnswerMaker(ranks, problem, wanted.tolerance, deadline)
-    kept, keeping, disk = ranks.agreed(
+    folder, keeping, disk = ranks.agreed(
         lambda: (
             checkpoints.wanted(wanted.resume, problem, wanted.checkpoint),
             checkpoints.Checkpoints.of(wanted.checkpoint, problem),
             Disk.of(wanted.rows_on_disk),
         )
     )
-    ranks.alike(kept is None, "folders of checkpoints")
+    ranks.alike(folder is None, "folders of checkpoints")
     try:
         lp = compiling.compiled(ranks, problem, deadline, disk)
     except TimeLimitReached as error:
         return maker.not_compiled(str(error), time.perf_counter() - started)
     maker.compile_seconds = time.perf_counter() - started
-    return _answered(maker, lp, wanted, progress, checkpoints.unfinished(kept, lp), keeping)
+    return _answered(maker, lp, wanted, progress, folder, keeping)
 
 
 def _answered(
@@ -89,10 +90,10 @@ def _answered(
     lp: StabilizationLP,
     wanted: Wanted,
     progress: Progress | None,
-    kept: checkpoints.Unfinished | None,
+    folder: Path | None,
     keeping: checkpoints.Checkpoints | None,
 ) -> Answer:
-    """Answer a compiled problem."""
+    """Answer a compiled problem; ``folder`` is that of a checkpoint to begin with."""
     ranks, deadline = maker.ranks, maker.deadline
     maker.of_model(lp)
     refused = maker.by_first(
@@ -105,6 +106,7 @@ def _answered(
     if progress:
         progress("solve", -1.0)
     started = time.perf_counter()
+    kept = checkpoints.unfinished(folder, lp)
     found = solving.solved(lp, wanted.tolerance, deadline, wanted.gathered, kept, keeping)
     maker.solve_seconds = time.perf_counter() - started
     late = ranks.any(deadline())
@@ -113,12 +115,17 @@ def _answered(
     if not late and whole.fits(lp, wanted.whole):
         return _by_first(maker, lp, wanted)
     if found is not None and found.certificate.refusal:
-        return _infeasible(maker, lp, wanted, found)
+        return _infeasible(maker, lp, wanted, found, folder, keeping)
     return maker.solved(found, late)
 
 
 def _infeasible(
-    maker: AnswerMaker, lp: StabilizationLP, wanted: Wanted, found: solving.Solved
+    maker: AnswerMaker,
+    lp: StabilizationLP,
+    wanted: Wanted,
+    found: solving.Solved,
+    folder: Path | None,
+    keeping: checkpoints.Checkpoints | None,
 ) -> Answer:
     """Return the refusal of gamma, or the answer on the other cells, as all ranks find it."""
     w = found.witness.refusal
@@ -127,7 +134,7 @@ def _infeasible(
         smaller = restricted(lp, w > 0, maker.first_cell)
         if smaller is not None:
             inner = maker.for_model()
-            return maker.restricted(_answered(inner, smaller, wanted, None, None, None), w)
+            return maker.restricted(_answered(inner, smaller, wanted, None, folder, keeping), w)
     limits = bracket.bracket(lp, w, wanted.gathered, maker.ranks.time_up(maker.deadline))
     return maker.infeasible(found, w, limits)
 

@@ -103,6 +103,28 @@ def test_the_first_checkpoint_is_continued(tmp_path, monkeypatch, whole, kept_by
     same(over(count, resume=folder), whole)
 
 
+@pytest.mark.parametrize("kept_by", [0, 2])
+def test_what_was_solved_on_some_cells_is_continued_there(tmp_path, kept_by):
+    """Where gamma is infeasible for the others; rank 0 has not the whole model."""
+    problem = MAP.replaced(gamma=3.5)
+
+    def solved(count, **folders):
+        if not count:
+            found = lm.solve(problem, restrict_to_gamma=True, **folders)
+            return found.status, found.control_index.tolist()
+        wanted = Wanted(restrict_to_gamma=True, whole=0, **folders)
+        every = as_threads(count, lambda ranks: answer(ranks, problem, wanted))
+        return every[0].status, joined(every, "control_index").tolist()
+
+    whole = solved(0)
+    assert solved(kept_by, checkpoint=tmp_path) == whole
+    control = np.load(arrays_of(tmp_path)[0]["control_index"])
+    assert control.tolist() == whole[1]
+    assert 0 < (control >= 0).sum() < lm.compile(problem).n
+    for count in (0, 3):
+        assert solved(count, resume=tmp_path) == whole
+
+
 def test_a_limit_leaves_its_last_policy(tmp_path, whole):
     found = lm.solve(MAP, checkpoint=tmp_path, max_iterations=1)
     assert found.status == "solver_failed"
