@@ -110,8 +110,7 @@ def _needs_all(ranks: Ranks, stored: archive.Stored) -> bool:
     limited = ranks.any(bool((result.cell_status[share] == CellStatus.BEYOND_GAMMA).any()))
     return bool(
         result.digest != 2 or beyond or whole or held or repaired or limited or stored.rewritten
-        or problem.successors == "enclosed"
-    )  # fmt: skip
+    )
 
 
 def _verified(
@@ -123,6 +122,8 @@ def _verified(
     maker.of_model(lp)
     first, last = (int(n) for n in maker.starts[ranks.rank : ranks.rank + 2])
     own = replace(result, **{name: getattr(result, name)[first:last] for name in VECTORS})
+    if result.sure_levels is not None:
+        own = replace(own, sure_levels=result.sure_levels[first:last])
     part = replace(lp, cells=lp.cells - first, _known=lp._algorithm_1)
     reasons, notes = list[str](), list[str]()
     same = digest.of_model(ranks, lp) == result.model_sha256
@@ -130,28 +131,39 @@ def _verified(
         notes.append("the recompiled model differs from the stored one; claims are judged on it")
     if not ranks.all(np.array_equal(lp.cell_status, own.cell_status)):
         reasons.append("cell_status differs from the recompiled model")
+    if not ranks.all(_same_levels(lp, own)):
+        reasons.append("sure_levels differ from the recompiled model")
     if result.status == Status.NOT_STABILIZABLE:
         certificate = judging.verdict(lp, Witness(None), maker.tolerance)
         reasons += _unproved(maker, result)
     else:
-        certificate = _judged(ranks, part, own, maker.tolerance, reasons)
+        certificate = _judged(lp, part, own, maker.tolerance, reasons)
         if result.status != Status.VERIFIED:
             reasons.append(f"the status is {result.status}, not verified")
     reasons += _differences(maker, part, own, stored, certificate)
     in_time = partial(deadline.raise_if_over, "verifying")
     ranks.agreed(in_time)
-    whole = replace(lp, cell_status=result.cell_status, mesh=None) if ranks.rank == 0 else lp
+    whole = lp
+    if ranks.rank == 0:
+        whole = replace(lp, cell_status=result.cell_status, sure_levels=None, mesh=None)
     reasons += by_first(
         ranks, lambda: audit.local_differences(whole, result, stored.certificate, deadline)
     )
     return Verification(not reasons, result.status, same, certificate, tuple(reasons), tuple(notes))
 
 
+def _same_levels(lp: StabilizationLP, own: Result) -> bool:
+    """Return whether what is stored of sure arrival, of own cells, is what was found."""
+    found, stored = lp.sure_levels, own.sure_levels
+    return found is stored if found is None or stored is None else np.array_equal(found, stored)
+
+
 def _judged(
-    ranks: Ranks, lp: StabilizationLP, own: Result, tolerance: float, reasons: list[str]
+    lp: StabilizationLP, part: StabilizationLP, own: Result, tolerance: float, reasons: list[str]
 ) -> Certificate:
-    """Judge the claims of what is stored for own cells."""
-    policy, on = policy_of(lp, own), lp.cells
+    """Judge the claims of what is stored for own cells, which ``part`` numbers from 0."""
+    assert lp.mesh is not None
+    ranks, policy, on = lp.mesh.ranks, policy_of(part, own), part.cells
     nothing = np.empty(0, dtype=np.int64)
     if not ranks.all(policy is not None or not lp.n):
         reasons.append("control_index is no policy on the stabilizable set")

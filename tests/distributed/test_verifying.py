@@ -1,6 +1,7 @@
 """Verifying over ranks finds what one process finds, of sound directories and of spoiled ones."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from saved_results import content, put_apart
 
 import lmdsl as lm
 from lmdsl import distributed
+from lmdsl.distributed.verifying import _same_levels
 from lmdsl.ranks.threaded import as_threads
 from lmdsl.results.directory import reading, vectors
 from lmdsl.slabs import compiling
@@ -142,3 +144,22 @@ def test_a_model_of_one_rank_that_is_another_one_is_refused(saved, monkeypatch):
 def test_what_cannot_be_read_is_one_error(tmp_path):
     with pytest.raises(lm.BadInput, match="is not a result directory"):
         over(2, tmp_path / "none")
+
+
+def test_enclosed_successors(tmp_path, monkeypatch):
+    """Claim 7 and sure levels, by all ranks; levels that are spoiled are refused."""
+    problem, out = sampled(5).replaced(successors="enclosed"), tmp_path / "out"
+    as_threads(2, lambda r: distributed.solve(problem, out=out, ranks=r))
+    assert require_alike(out).holds
+    monkeypatch.setattr("lmdsl.distributed.verifying.verify_alone", None)
+    found = over(3, out)
+    assert found.holds
+    assert found.certificate.safe
+
+    own = lm.Result.load(out)
+    lp = as_threads(1, lambda ranks: compiling.compiled(ranks, problem))[0]
+    assert _same_levels(lp, own)
+    levels = own.sure_levels.copy()
+    levels[-1] += 1
+    assert not _same_levels(lp, replace(own, sure_levels=levels))
+    assert not _same_levels(lp, replace(own, sure_levels=None))
