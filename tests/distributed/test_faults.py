@@ -51,13 +51,14 @@ FAULTS = [  # a fault, the exit status, and what is said
     ("saving:memory:0", 2, "out of memory"),
     ("saved:odd:0", 4, "internal error"),
 ]
-OFTEN = {"levels:odd", "saving:full"}  # the others at length
+OFTEN = {"levels:odd", "saving:full"}  # the others on request
+SELDOM = pytest.mark.long, pytest.mark.full
 
 
 @needs_mpi
 @pytest.mark.parametrize(
     ("fault", "status", "words"),
-    [pytest.param(*f, marks=() if f[0] in OFTEN else pytest.mark.long) for f in FAULTS],
+    [pytest.param(*f, marks=() if f[0] in OFTEN else SELDOM) for f in FAULTS],
 )
 def test_an_error_of_one_rank_is_said_once_and_leaves_nothing(tmp_path, fault, status, words):
     code, said, _ = ended(started(tmp_path, fault, "--out", tmp_path / "out"))
@@ -112,7 +113,7 @@ def told(process, folder, whom, number):
         ("blocks", "launcher", signal.SIGINT),
         ("blocks", 1, signal.SIGTERM),
         *(
-            pytest.param(*each, marks=pytest.mark.long)
+            pytest.param(*each, marks=SELDOM)
             for each in [
                 ("waits", "launcher", signal.SIGINT),
                 ("waits", "launcher", signal.SIGTERM),
@@ -133,7 +134,9 @@ def test_signals_end_all_also_in_a_compiled_loop(tmp_path, kind, whom, number):
 
 
 @needs_mpi
-@pytest.mark.parametrize("count", [1, *(pytest.param(n, marks=pytest.mark.long) for n in (2, 3))])
+@pytest.mark.parametrize(
+    "count", [1, pytest.param(2, marks=pytest.mark.long), pytest.param(3, marks=SELDOM)]
+)
 def test_a_killed_solve_is_resumed_by_any_number(tmp_path, count):
     """Every policy is kept; the last rank is killed once the first one was."""
     kept = tmp_path / "kept"

@@ -290,6 +290,7 @@ def test_a_spoiled_checkpoint_is_refused_or_harmless(
 
 
 @pytest.mark.long
+@pytest.mark.full
 @settings(max_examples=500, deadline=None)
 @SPOILED
 def test_spoiled_checkpoints_at_length(tmp_path_factory, whole, **how):
