@@ -56,8 +56,12 @@ class Division:
         return {k: owner == k for k in some}
 
     @classmethod
-    def cut(cls, pairs: NDArray[np.integer], count: int) -> "Division":
+    def cut(
+        cls, pairs: NDArray[np.integer], count: int, cells: NDArray[np.integer] | None = None
+    ) -> "Division":
         """Divide cells that have so many pairs each, for ``count`` ranks.
+
+        ``cells`` are so many cells, one after the other, of each entry of ``pairs``; default one.
 
         The ranges have about equal numbers of pairs: range r begins with the first cell up to
         which a share of r in all of the pairs lies before it. (A cell without a pair counts as one,
@@ -65,10 +69,15 @@ class Division:
         """
         ranges = RANGES if RANGES % count == 0 else count
         weight = np.maximum(np.asarray(pairs, dtype=np.int64), 1)
-        before = np.concatenate([[0], np.cumsum(weight)])  # whole numbers: the same everywhere
+        every = weight if cells is None else weight * cells
+        before = np.concatenate([[0], np.cumsum(every)])  # whole numbers: the same everywhere
         wanted = np.arange(ranges + 1, dtype=np.int64)
         share = (before[-1] // ranges) * wanted + (before[-1] % ranges) * wanted // ranges
         bounds = np.searchsorted(before, share).astype(np.int64)
+        if cells is not None and len(weight):  # within equal cells by division, rounded up
+            at = np.maximum(bounds - 1, 0)
+            first = np.concatenate([[0], np.cumsum(cells)])[at]
+            bounds = first - (before[at] - share) // weight[at]
         return cls(bounds, np.arange(count + 1, dtype=np.int64) * (ranges // count))
 
     def within(self, ranks: Ranks, kept: NDArray[np.bool_]) -> "Division":

@@ -47,6 +47,17 @@ def test_ranges_do_not_depend_on_the_ranks_that_divide_them():
         assert Division.cut(pairs, count).bounds.tolist() != bounds[0]
 
 
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(st.integers(0, 9), st.integers(0, 12)), min_size=1, max_size=12),
+    st.sampled_from([1, 2, 3, 4, 7]),
+)
+def test_cells_that_are_alike_need_not_be_told_one_by_one(runs, count):
+    pairs, cells = np.array(runs).T
+    one = Division.cut(np.repeat(pairs, cells), count)
+    assert Division.cut(pairs, count, cells).bounds.tolist() == one.bounds.tolist()
+
+
 def test_ranges_stay_together_when_cells_are_left_out():
     kept = np.random.default_rng(5).random(200) < 0.3
 

@@ -162,7 +162,7 @@ def divided(
     """
     F = len(sets.free)
     if isinstance(problem.system, MatrixSystem) or not F:
-        return Division.cut(np.ones(F, dtype=np.int64), count)
+        return Division.cut(np.ones(1, dtype=np.int64), count, np.array([F]))
     some = np.unique(np.linspace(0, F - 1, min(F, LOOKED_AT)).astype(np.int64))
     sampler = Sampler(problem, partition, deadline, sets=sets)
     M = len(sampler.controls)
@@ -175,5 +175,5 @@ def divided(
             target = sets.number[np.where(np.isnan(index), 0.0, index).astype(np.int64)]
             target[np.isnan(index)] = -1
             found[at] += int((target >= 0).all(axis=1).sum())
-    near = np.searchsorted((some[1:] + some[:-1]) // 2, np.arange(F))
-    return Division.cut(found[near], count)
+    ends = np.concatenate([(some[1:] + some[:-1]) // 2 + 1, [F]])  # of the cells around each
+    return Division.cut(found, count, np.diff(ends, prepend=0))
