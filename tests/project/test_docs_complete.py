@@ -152,6 +152,7 @@ def test_every_public_name_is_described():
     assert not missing(lm.__all__, text)
     for module in (lm.backends, lm.testing):
         assert not missing(module.__all__, text)
+    assert not missing(lm.distributed.__all__, doc("distributed.md"))
     assert not missing([name for name in vars(lm.systems) if name[0].isupper()], text)
     for record in (lm.StabilizationLP, lm.Certificate, lm.Controller, lm.Simulation,
                    lm.Comparison, lm.Verification, lm.GammaBar, lm.Result, lm.testing.Check,
