@@ -1,5 +1,6 @@
 """Answers made of what ranks found: arrays of own cells, facts that all share."""
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -252,23 +253,28 @@ class AnswerMaker:
         return full
 
     def _beside(self, witness: Witness) -> "_Beside":
-        """Return what rank 0 finds out beside the proof, and the sentences about it."""
+        """Return what rank 0 finds out beside the proof, and the sentences about it.
+
+        Of a map without a local controller that needs nothing of all cells.
+        """
         lp, finish = self.lp, self.deadline.again()
-        status = self.ranks.gathered(lp.cell_status)
+        equation = lp.problem.flow(cost=False) is not None
+        needed = equation or lp.problem.local_controller is not None
+        status = self.ranks.gathered(lp.cell_status) if needed else None
         hold = None if lp.hold is None else self.ranks.gathered(lp.hold)
         data = self._data(witness, finish)
 
         def found() -> Any:
-            assert status is not None
-            own = replace(lp, cell_status=status, hold=hold, mesh=None)
-            try:
-                error = integration_error(lp.problem, sets_of(status), finish)
-            except TimeLimitReached:
-                error = None
+            error, local = None, None
+            if status is not None and equation:
+                with contextlib.suppress(TimeLimitReached):
+                    error = integration_error(lp.problem, sets_of(status), finish)
+            if status is not None:
+                local = check_of(replace(lp, cell_status=status, hold=hold, mesh=None), finish)
             held = holding.note(lp.problem, lp.partition, hold)
             notes = [attractor_note(lp.problem, lp.partition), held,
                      data.sentence() if data else "", error.warning() if error else ""]  # fmt: skip
-            return check_of(own, finish), error, data, notes
+            return local, error, data, notes
 
         beside: _Beside = self.by_first(found)
         return beside
