@@ -48,6 +48,9 @@ class Answer(Summary):
         As of a Result.
     model_sha256, digest
         Version 2 of the digest of the model: the same for every number of ranks.
+    ghosts
+        Number of cells of others that ranks keep values of, for each cell of C: what talking costs.
+        None where nothing was compiled.
     lp
         The model of own cells, as :func:`lmdsl.slabs.compiling.compiled` returns it.
     """
@@ -75,6 +78,7 @@ class Answer(Summary):
     digest: int = 2
     gap_before_polish: None = None
     proof: None = None
+    ghosts: float | None = None
     lp: StabilizationLP | None = field(default=None, compare=False)
 
     @property

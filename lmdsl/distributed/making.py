@@ -33,6 +33,7 @@ from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Seconds, Summary
 from lmdsl.slabs import digest
+from lmdsl.slabs.chains.first import First
 from lmdsl.slabs.gamma import whole
 from lmdsl.slabs.gamma.restricting import restricted
 from lmdsl.slabs.solving import Solved
@@ -173,7 +174,8 @@ class AnswerMaker:
         assert facts is not None
         arrays: dict[str, Any] = {name: self._scattered(result, name) for name in ARRAYS}
         return Answer(**facts, **arrays, partition=self.lp.partition, starts=self.starts,
-                      control_vectors=self.lp.controls, lp=self._left(facts, arrays))  # fmt: skip
+                      control_vectors=self.lp.controls, ghosts=self._ghosts(),
+                      lp=self._left(facts, arrays))  # fmt: skip
 
     def _left(self, facts: dict[str, Any], arrays: dict[str, Any]) -> StabilizationLP:
         """Return the model of which rank 0 speaks, as it was asked, of own cells; collective."""
@@ -218,7 +220,7 @@ class AnswerMaker:
             measure=self._over(witness.mu, 0.0, 0.0, 0.0), cell_status=lp.cell_status,
             witness=self._over(w, 0.0, 0.0, 0.0), sure_levels=lp.sure_levels, dropped=lp.dropped,
             sure=self._sure(), ended_by_discount=self._ended(witness, proof),
-            model_sha256=digest.of_model(self.ranks, lp), lp=lp, **more,
+            model_sha256=digest.of_model(self.ranks, lp), lp=lp, ghosts=self._ghosts(), **more,
         )  # fmt: skip
 
     def _ended(self, witness: Witness, proof: Certificate) -> float | None:
@@ -227,6 +229,11 @@ class AnswerMaker:
         if b is None or self.lp.gamma != 1 or not proof.measure or witness.mu is None:
             return None
         return min(1.0, (1 - b) * math.fsum(self.ranks.collect(math.fsum(witness.mu))))
+
+    def _ghosts(self) -> float:
+        """Return how many cells of others ranks know, for each cell of C; collective."""
+        mesh = First(self.lp).mesh
+        return sum(self.ranks.collect(len(mesh.ghosts))) / max(mesh.division.cells, 1)
 
     def _sure(self) -> int | None:
         levels = self.lp.sure_levels

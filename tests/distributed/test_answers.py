@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from alike import alike, sampled
+from alike import alike, answers, sampled
 
 import lmdsl as lm
 
@@ -33,3 +33,10 @@ def test_random_problems(seed, status, cause):
 def test_all_cells_are_required():
     one = alike(sampled(9), (2,), require_all=True)
     assert one.cause == "require_all"
+
+
+def test_how_many_cells_of_others_ranks_know():
+    """None alone; more ranks know more, and at most all others each."""
+    ghosts = [answers(MAP, count)[0].ghosts for count in (1, 2, 4)]
+    assert ghosts[0] == 0
+    assert 0 < ghosts[1] < ghosts[2] <= 3
