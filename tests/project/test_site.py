@@ -59,7 +59,7 @@ def labels(function) -> list[str]:
 
 
 def test_every_line_of_a_report_is_explained():
-    lines = [*labels(solving._summary), *labels(DataReport.rows)]
+    lines = [*labels(solving.summary), *labels(DataReport.rows)]
     assert {"problem", "pairs", "improved", "gamma_bar", "assumes", "true cost"} <= {*lines}
     assert not missing(lines, WORDS)
 
@@ -92,5 +92,5 @@ def test_every_option_says_what_it_does():
 
 def test_letters_of_the_mathematics_are_not_printed():
     """A, Z and C are for formulas; the reports of the command line say what they stand for."""
-    for text in (inspect.getsource(solving._summary), inspect.getsource(solving._enclosed)):
+    for text in (inspect.getsource(solving.summary), inspect.getsource(solving._enclosed)):
         assert not re.search(r'"[^"]*\b[AZC]\b[^"]*"', text)
