@@ -20,8 +20,8 @@ from lmdsl.ranks.verbs import Item, Ranks
 INTERRUPTED, FAILED, NO_MEMORY = 130, 4, 2  # exit statuses
 WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
 # Seconds that a rank leaves to those below it, which may have met the same, to speak and to end
-# all; at most; and after which a process ends by itself.
-TURN, LATEST, PATIENCE = 0.25, 2.0, 2.0
+# all; at most; after which what was said is on its way; and after which a process ends by itself.
+TURN, LATEST, SPOKEN, PATIENCE = 0.25, 2.0, 0.1, 2.0
 
 
 def together(ranks: Ranks, program: Callable[[Ranks], Item]) -> Item:
@@ -58,19 +58,25 @@ def _said(error: BaseException) -> tuple[str, int]:
 
 
 def _end_all(ranks: MpiRanks, message: str, status: int) -> None:
-    """Say why, unless a rank below is faster, and end all ranks."""
-    time.sleep(min(TURN * ranks.rank, LATEST))
-    text = f"lmdsl: rank {ranks.rank} of {ranks.count}: {message}\n"
-    with contextlib.suppress(OSError):
-        os.write(2, text.encode(errors="replace"))
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # MPI has more to say, and nothing new
+    """Say why, unless another rank did, and end all ranks.
+
+    Launchers end the others by SIGTERM, whose handlers come here as well.
+    """
     threading.Thread(target=_leave, args=(status,), daemon=True).start()
+    time.sleep(min(TURN * ranks.rank, LATEST))
+    if not ranks.ending():
+        ranks.tell_ending()
+        text = f"lmdsl: rank {ranks.rank} of {ranks.count}: {message}\n"
+        with contextlib.suppress(OSError):
+            os.write(2, text.encode(errors="replace"))
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # MPI has more to say, and nothing new
+        time.sleep(SPOKEN)
     ranks.abort(status)
 
 
 def _leave(status: int) -> None:
     """End this process, should MPI not do it."""
-    time.sleep(PATIENCE)
+    time.sleep(LATEST + SPOKEN + PATIENCE)
     os._exit(status)
 
 

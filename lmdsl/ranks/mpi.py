@@ -19,7 +19,8 @@ from lmdsl.machine import memory, threads
 from lmdsl.ranks.launchers import launched
 from lmdsl.ranks.verbs import Alone, Item, RankError, Ranks, require_expected
 
-TAG, TROUBLE = 7, 8  # of messages between two ranks, and of those that one has failed
+# Of messages between two ranks, of those that one has failed, and that one ends all.
+TAG, TROUBLE, ENDING = 7, 8, 9
 KINDS = "?bhilqBHILQfd"  # types of arrays, by NumPy's character
 SMALL = 512  # bytes up to which all that is collected goes in one round
 
@@ -124,6 +125,21 @@ class MpiRanks(Ranks):
                 f"rank {self.rank} is at its verb number {self.traffic.calls}, rank {odd[0]} at "
                 f"number {calls[odd[0]]}"
             )
+
+    def tell_ending(self) -> None:
+        """Tell all others that this rank says why, and ends all."""
+        others = [k for k in range(self.count) if k != self.rank]
+        self._told += [self.world.Isend(np.empty(0, np.uint8), k, ENDING) for k in others]
+
+    def ending(self) -> bool:
+        """Return whether another rank has told that it ends all."""
+        from mpi4py import MPI
+
+        for _ in range(10):  # what has come is not seen at once
+            if self.world.Iprobe(MPI.ANY_SOURCE, ENDING):
+                return True
+            time.sleep(0.005)
+        return False
 
     def abort(self, status: int) -> None:
         """End all ranks, whatever they are doing."""

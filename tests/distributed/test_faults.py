@@ -38,7 +38,9 @@ def ended(process):
         out, error = process.communicate(timeout=LONG)
     finally:
         process.kill()
-    return process.returncode, error.splitlines(), out
+    said = [line for line in error.splitlines() if line.startswith("lmdsl:")]
+    assert "Traceback" not in error
+    return process.returncode, said, out  # launchers have more to say
 
 
 FAULTS = [  # a fault, the exit status, and what is said
@@ -127,9 +129,10 @@ def told(process, folder, whom, number):
 def test_signals_end_all_also_in_a_compiled_loop(tmp_path, kind, whom, number):
     process = started(tmp_path, f"solving:{kind}", "--out", tmp_path / "out")
     code, said, _ = told(process, tmp_path, whom, number)
-    assert code == 128 + number
+    assert code == 128 + number or (whom == "launcher" and code)  # Open MPI's says 1
     words = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}[number]
-    assert said == [f"lmdsl: rank {1 if whom == 1 else 0} of 2: {words}"]
+    if said or code == 128 + number:  # else the launcher, Open MPI's, was faster
+        assert said == [f"lmdsl: rank {1 if whom == 1 else 0} of 2: {words}"]
     assert sorted(os.listdir(tmp_path)) == ["problem.json", "ready0", "ready1"]
 
 
