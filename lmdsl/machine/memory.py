@@ -8,7 +8,7 @@ the address space and data of ``ulimit``, and the share of a Slurm job.
 import contextlib
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,20 +53,21 @@ def fits(estimate: float) -> bool:
     return estimate <= SMALL or estimate <= available().bytes
 
 
-def require(estimate: float, what: str, remedy: str = "") -> None:
+def require(estimate: float, what: str, remedy: Callable[[], str] = str) -> None:
     """Refuse work whose estimate exceeds the available memory, before any of it is taken.
 
-    ``remedy`` is what else helps than a smaller problem.
+    ``remedy`` is asked then what else helps than a smaller problem.
     """
     if estimate <= SMALL:
         return
     free = available()
     if estimate > free.bytes:
+        other = remedy()
         raise BadInput(
             f"the problem needs about {human(estimate)} of memory ({what}) and {human(free.bytes)} "
             f"are available ({free.limit}); use fewer cells, controls, sample points or noise nodes"
-            + f", {remedy}"
-            * bool(remedy)
+            + f", {other}"
+            * bool(other)
         )
 
 

@@ -42,7 +42,7 @@ def require_room(
         disk.require(rows)
         memory.require(need, f"{how}, rows on disk")
     else:
-        memory.require(need, how, _remedy(estimate(problem, pilot, True, share), rows))
+        memory.require(need, how, lambda: _remedy(estimate(problem, pilot, True, share), rows))
     return need
 
 
