@@ -35,6 +35,7 @@ def main() -> int:
         sizes = ranks.QUICK if options.quick else ranks.SIZES
         ranks.measure(run, _whole(options.cells, sizes), _whole(options.ranks, ranks.COUNTS),
                       options.by_all)  # fmt: skip
+        ranks.agree(run, options.quick)
     if options.smoke:
         _smoke(run, names or list(models.SMOKE))
     else:
@@ -89,7 +90,7 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--cells", metavar="N,...", help="cells an axis in ranks")
     parser.add_argument("--ranks", metavar="R,...", help="numbers of ranks in ranks")
     parser.add_argument("--by-all", action="store_true", help="in ranks: all evaluate policies")
-    parser.add_argument("--quick", action="store_true", help="in ranks: one small size")
+    parser.add_argument("--quick", action="store_true", help="in ranks: little")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results")
     parser.add_argument("--smoke", action="store_true", help="tiny models, once, under a minute")
     return parser.parse_args()

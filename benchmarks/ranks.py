@@ -46,6 +46,30 @@ def measure(run: Run, sizes: Iterable[int], counts: Iterable[int], everybody: bo
             run.save()
 
 
+def agree(run: Run, dozen: bool) -> None:
+    """Ask whether all shipped systems and 50 random problems are answered as in one process.
+
+    Over 1, 2, 3, 4 and 7 ranks as threads, and 2 and 4 processes where there is an MPI.
+    """
+    helper = ROOT / "tests" / "helpers" / "matrix.py"
+    command = [sys.executable, str(helper), *(["--dozen"] if dozen else [])]
+    command += [] if _missing() else ["--mpi", "2,4"]
+    done = subprocess.run(
+        command,
+        env=environment(**ONE_THREAD),
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    for line in done.stdout.splitlines():
+        run.log(line)
+    last = (done.stdout.splitlines() or [done.stderr[-300:]])[-1]
+    how = "1, 2, 3, 4, 7 ranks" + ("" if _missing() else ", 2 and 4 processes")
+    run.targets.append(_row(f"as in one process: {how}", "all", last, done.returncode == 0))
+    run.save()
+
+
 def _of_size(run: Run, cells: int, counts: list[int], mode: str) -> Iterator[dict[str, Any]]:
     found: dict[int, list[list[Report]]] = {0: [], **{count: [] for count in counts}}
     name = f"standard map, {cells} x {cells}"

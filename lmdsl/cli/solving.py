@@ -192,6 +192,9 @@ def summary(result: Any) -> str:
     if result.sure_cells is not None:
         rows.append(("enclosed", _enclosed(result)))
     rows += about
+    if getattr(result, "ghosts", None) is not None:
+        rows.append(("ranks", f"{len(result.starts) - 1}, which keep values of {result.ghosts:.2g} "
+                              "cells of others for each of C"))  # fmt: skip
     if result.local_controller:
         rows.append(("local", result.local_controller.sentence()))
     if result.integration_error:

@@ -5,6 +5,7 @@ bit, because cells see new values within the ranges of the model only; with othe
 the last policy is the same, as ties are broken by rule.
 """
 
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -31,6 +32,7 @@ class Solved:
     witness: Witness
     certificate: Certificate
     steps: int  # improvement steps that changed the policy
+    judged: float  # seconds that judging took
 
 
 def solved(
@@ -54,8 +56,7 @@ def solved(
     if begun is None:
         w = refusing.refusal(lp, time_up)
         if w is not None:
-            witness = Witness(None, refusal=w)
-            return Solved(witness, judging.verdict(lp, witness, tolerance), 0)
+            return _judged(lp, Witness(None, refusal=w), tolerance, 0)
         begun = beginning.raised(lp, by, gathered, time_up)
     if begun is None:
         return None
@@ -65,12 +66,20 @@ def solved(
     if keep is not None:
         keep(policy, value, last=True)
     witness = by.witness(policy, value, tolerance)
-    certificate = judging.verdict(lp, witness, tolerance)
-    if certificate.gap is None or certificate.gap > tolerance:  # the same on every rank
+    found = _judged(lp, witness, tolerance, steps)
+    gap = found.certificate.gap
+    if gap is None or gap > tolerance:  # the same on every rank
         W = below.lower_vector(lp, value, tolerance, time_up)
-        witness = replace(witness, W=W)
-        certificate = judging.verdict(lp, witness, tolerance)
-    return Solved(witness, certificate, steps)
+        again = _judged(lp, replace(witness, W=W), tolerance, steps)
+        found = replace(again, judged=found.judged + again.judged)
+    return found
+
+
+def _judged(lp: StabilizationLP, witness: Witness, tolerance: float, steps: int) -> Solved:
+    """Return an answer with the certificate that judging it gives; collective."""
+    started = time.perf_counter()
+    certificate = judging.verdict(lp, witness, tolerance)
+    return Solved(witness, certificate, steps, time.perf_counter() - started)
 
 
 def _ties_broken(

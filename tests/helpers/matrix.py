@@ -1,6 +1,6 @@
 """All shipped systems and 50 random problems over ranks, beside one process.
 
-Run:  python tests/helpers/matrix.py [--ranks 1,2,3,4,7] [--mpi 2,4] [NAME ...]
+Run:  python tests/helpers/matrix.py [--ranks 1,2,3,4,7] [--mpi 2,4] [--dozen] [NAME ...]
 
 Prints what is not alike, and how many problems are; the exit status is 1 where one is not.
 """
@@ -96,12 +96,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--ranks", default=",".join(map(str, COUNTS)))
     parser.add_argument("--mpi", default="")
+    parser.add_argument("--dozen", action="store_true", help="a dozen of each kind")
     parser.add_argument("names", nargs="*")
     asked = parser.parse_args()
     counts, processes = (
         [int(n) for n in text.split(",") if n] for text in (asked.ranks, asked.mpi)
     )
-    names, bad = asked.names or [*SHIPPED, *ZOO, *RANDOM], 0
+    names, bad = asked.names or (DOZEN if asked.dozen else [*SHIPPED, *ZOO, *RANDOM]), 0
     for name, said in faults(names, counts, processes):
         bad += bool(said)
         print(f"{name}: {'; '.join(said) or 'alike'}", flush=True)
