@@ -192,9 +192,7 @@ def summary(result: Any) -> str:
     if result.sure_cells is not None:
         rows.append(("enclosed", _enclosed(result)))
     rows += about
-    if getattr(result, "ghosts", None) is not None:
-        rows.append(("ranks", f"{len(result.starts) - 1}, which keep values of {result.ghosts:.2g} "
-                              "cells of others for each of C"))  # fmt: skip
+    rows += _ranks(result)
     if result.local_controller:
         rows.append(("local", result.local_controller.sentence()))
     if result.integration_error:
@@ -260,6 +258,15 @@ def _discount(result: Any) -> str:
     if ended is None:
         return text
     return f"{text}: {100 * (1 - ended):.4g} % end in the attractor, {100 * ended:.4g} % before"
+
+
+def _ranks(result: Any) -> list[tuple[str, str]]:
+    """Return how many ranks there are, and how much they ask each other, where there are some."""
+    ghosts = getattr(result, "ghosts", None)
+    if ghosts is None:
+        return []
+    count = len(result.starts) - 1
+    return [("ranks", f"{count}, which keep values of {ghosts:.2g} cells of others for each of C")]
 
 
 def _others(result: Any) -> str:

@@ -68,8 +68,8 @@ def test_a_launcher_that_mpi_does_not_see_is_refused_once(tmp_path, file, withou
 
 
 def numbers_out(text):
-    """A summary without the seconds that it took, and the last digits of gaps."""
-    text = re.sub(r"seconds .*", "seconds", text)
+    """A summary without ranks, the seconds that it took, and the last digits of gaps."""
+    text = re.sub(r"ranks  +2, .*\n", "", re.sub(r"seconds .*", "seconds", text))
     return re.sub(r"(gap|within|contraction) +\S+", r"\1", text)
 
 
@@ -80,6 +80,7 @@ def test_solve_says_what_one_process_says(tmp_path, file, capsys):
     assert (done.returncode, done.stderr) == (status, "")
     expected = numbers_out(out).replace(str(tmp_path / "one"), str(tmp_path / "two"))
     assert numbers_out(done.stdout) == expected
+    assert re.search(r"^ranks +2, which keep values of 0\.\d+ cells of others", done.stdout, re.M)
     assert lm.verify(tmp_path / "two").holds
     status, out, _ = run(capsys, "verify", tmp_path / "two")
     done = over(2, "verify", tmp_path / "two")
