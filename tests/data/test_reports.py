@@ -60,9 +60,9 @@ def test_the_command_line_names_what_is_assumed(tmp_path, capsys):
     assert "assumed: no transition occurs that was not recorded" in capsys.readouterr().out
     assert main(["simulate", str(tmp_path / "out"), "--starts", "50"]) == 0
     assert "50 runs of the recorded rows from random starts" in capsys.readouterr().out
-    from lmdsl.cli.solving import _summary
+    from lmdsl.cli.solving import summary
 
-    text = _summary(result)
+    text = summary(result)
     for word in ("84 of 84 transitions used", "support, independence", "true cost", "unseen"):
         assert word in text
 

@@ -10,6 +10,8 @@ from launching import needs_mpi
 
 import lmdsl as lm
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 
 @pytest.mark.parametrize("name", matrix.DOZEN)
 def test_a_dozen_problems(name):

@@ -16,6 +16,8 @@ from lmdsl.ranks.threaded import as_threads
 from lmdsl.results.directory import reading, vectors
 from lmdsl.slabs import compiling
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 
 def over(count, path, **options):
     """What so many ranks find, all the same."""

@@ -19,9 +19,9 @@ def status(name):
     return int(line.split()[1]) * 1024
 
 
-def require_noted(estimate, what):
+def require_noted(estimate, what, *remedy):
     held.append(status("VmRSS") - before + int(estimate))
-    return require(estimate, what)
+    return require(estimate, what, *remedy)
 
 
 def fits_noted(estimate):

@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from pathlib import Path
 
 import house
@@ -262,6 +263,12 @@ def test_no_test_file_is_too_long():
         for path in (PACKAGE.parent / "tests").rglob("test_*.py")
     }
     assert {name for name, lines in lengths.items() if lines > 400} == set()
+
+
+def test_each_test_file_has_a_name_of_its_own():
+    """Test files are modules without a package: two of one name cannot be collected together."""
+    names = Counter(path.name for path in (PACKAGE.parent / "tests").rglob("test_*.py"))
+    assert [name for name, count in names.items() if count > 1] == []
 
 
 def test_what_the_code_refers_to_is_there():

@@ -154,7 +154,7 @@ def test_an_output_format_is_a_file_and_a_line(copy):
 
 def test_a_problem_key_is_its_model_and_its_use(copy):
     copy.line("problem/problem.py", "gamma: Positive", "price: Positive = 1.0")
-    copy.change("model/lp.py", r"cost=transitions\.cost\[kept\]", r"\g<0> * problem.price")
+    copy.change("model/lp.py", r"cost=own\.cost", r"\g<0> * problem.price")
     assert copy.solved({**steps(), "price": 2})["cost"] == pytest.approx(4)
     assert json.loads((copy.folder / "out/problem.json").read_text())["price"] == 2
     copy.assert_as_documented("a problem key")

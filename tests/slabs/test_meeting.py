@@ -16,6 +16,8 @@ from lmdsl.slabs import compiling, judging, solving
 from lmdsl.slabs.digest import of_model
 from lmdsl.slabs.graph.meeting import Marks, OwnSuccessors
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 BY_CELL = ("cell_status", "sure_levels", "hold")
 

@@ -23,6 +23,8 @@ from lmdsl.proof.prover import Prover
 from lmdsl.proof.record import Proof
 from lmdsl.results.directory.proved import loop_of
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 KEPT = [None, {"kind": "hold"}, {"kind": "hold", "partial": True}]
 
 # Down a field of cells, of which y never changes: every image ends on edges of cells there.
@@ -178,12 +180,10 @@ def follow(seed, count, most):
     return arrives / count
 
 
-@pytest.mark.long
 def test_what_is_proved_happens():
     assert follow(0, 12, 1_000) > 0.1
 
 
-@pytest.mark.long
 @pytest.mark.full
 def test_what_is_proved_happens_in_many_loops():
     assert follow(1, 150, 4_000) > 0.1
@@ -199,7 +199,6 @@ def shorter(*args, **options):
 WHOLE = ranges.enclosed
 
 
-@pytest.mark.long
 def test_runs_find_out_ranges_that_are_too_short(monkeypatch):
     monkeypatch.setattr("lmdsl.proof.images.whole.ranges.enclosed", shorter)
     with pytest.raises(AssertionError):

@@ -16,6 +16,8 @@ from lmdsl.slabs import compiling
 from lmdsl.slabs.gamma import bracket, refusing
 from lmdsl.slabs.gamma.restricting import restricted
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 MAP = lm.load(Path(__file__).parents[2] / "examples/standard_map.json").replaced(gamma=2.6)
 
 
