@@ -7,6 +7,8 @@ from alike import alike, answers, sampled
 
 import lmdsl as lm
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 MAP = lm.load(Path(__file__).parents[2] / "examples/standard_map.json")
 
 

@@ -15,6 +15,8 @@ from problems import standard_map
 
 import lmdsl as lm
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 SCRIPT = Path(__file__).parents[1] / "helpers/faulty_ranks.py"
 LONG = 50  # seconds after which something is taken to hang; all takes three, most to start
 

@@ -16,6 +16,8 @@ from lmdsl.distributed import saving
 from lmdsl.ranks.threaded import as_threads
 from lmdsl.results.directory import vectors, writing
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 OURS = {"certificate.json", "problem.json", *(f"{name}.npy" for name in vectors.TYPES)}
 

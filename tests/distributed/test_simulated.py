@@ -11,6 +11,8 @@ from lmdsl.distributed.answering import answer
 from lmdsl.distributed.simulating import Controlled, gathered, simulated
 from lmdsl.ranks.threaded import as_threads
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 

@@ -15,6 +15,8 @@ from lmdsl.slabs.chains import peeling
 from lmdsl.slabs.chains.peeling import SpreadPeeled
 from lmdsl.slabs.chains.sweeping import SpreadSystem
 
+pytestmark = pytest.mark.long  # in other versions it would find nothing else
+
 SHAPE = (12, 10)
 
 
