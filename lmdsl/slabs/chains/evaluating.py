@@ -112,7 +112,7 @@ class ByFirst:
         return Witness(policy, **own)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KnownChain:
     """The chain of a policy; its rows may lie in the slots of a screen, until they change."""
 
