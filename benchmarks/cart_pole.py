@@ -9,9 +9,7 @@ CELLS`` says what others would take, by the line through what was measured.
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -20,8 +18,8 @@ from typing import Any
 import numpy as np
 
 import lmdsl as lm
-from benchmarks.process import MARK, ROOT, Failed, ended, environment
-from benchmarks.ranks import ONE_THREAD, _launcher, _missing
+from benchmarks.process import Failed
+from benchmarks.ranks import _launcher, _missing, reported
 
 COLUMNS = (
     "cells", "pairs", "C", "arrive", "gap", "ghosts / own", "MB a rank", "B a cell", "compile s",
@@ -83,20 +81,9 @@ def solved(cells: tuple[int, ...], count: int, out: Path, limit: float) -> Found
     """
     command = [_launcher() or "mpiexec", "-n", str(count), sys.executable, "-m",
                "benchmarks.cart_pole_ranks", name(cells), str(out)]  # fmt: skip
-    try:
-        done = subprocess.run(
-            command, env=environment(**ONE_THREAD), cwd=ROOT, capture_output=True, text=True,
-            timeout=limit, check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        raise Failed(f"> {limit:g} s") from None
-    for said in done.stdout.splitlines():
-        if said.startswith(MARK):
-            found: Found = json.loads(said.removeprefix(MARK))
-            runs = lm.Result.load(out).simulate(RUNS, STEPS)
-            return {**found, "runs": {"starts": runs.starts, "reached": runs.reached}}
-    last = [said for said in done.stderr.splitlines() if said.strip()]
-    raise Failed(last[-1][:300] if last else ended(done.returncode))
+    found: Found = reported(command, limit)
+    runs = lm.Result.load(out).simulate(RUNS, STEPS)
+    return {**found, "runs": {"starts": runs.starts, "reached": runs.reached}}
 
 
 def row(found: Found) -> list[str]:

@@ -167,6 +167,18 @@ def launched(count: int, cells: int, mode: str, limit: float) -> list[Report]:
     launcher = _launcher()
     if count and launcher:
         command = [launcher, "-n", str(count), *command]
+    found: list[Report] = reported(command, limit)
+    return found
+
+
+def reported(command: list[str], limit: float) -> Any:
+    """Return what a command of one thread a process reports in a line of its own.
+
+    Raises
+    ------
+    Failed
+        With the last line that was written, or the limit.
+    """
     try:
         done = subprocess.run(
             command, env=environment(**ONE_THREAD), cwd=ROOT, capture_output=True, text=True,
@@ -176,7 +188,6 @@ def launched(count: int, cells: int, mode: str, limit: float) -> list[Report]:
         raise Failed(f"> {limit:g} s") from None
     for line in done.stdout.splitlines():
         if line.startswith(MARK):
-            found: list[Report] = json.loads(line.removeprefix(MARK))
-            return found
+            return json.loads(line.removeprefix(MARK))
     last = [line for line in done.stderr.splitlines() if line.strip()]
     raise Failed(last[-1][:300] if last else ended(done.returncode))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from problems import made
 from proved_points import box_at, drawn, exceptions
-from test_random_loops import random_problem
+from test_random_loops import proved, random_problem
 
 import lmdsl as lm
 from lmdsl.machine.deadline import Deadline
@@ -14,13 +14,11 @@ from lmdsl.model.discretization import control_vectors
 from lmdsl.model.successors import ranges
 from lmdsl.model.successors.left_out.staying import Staying
 from lmdsl.proof import proving
-from lmdsl.proof.bounds.tightening import tighten
 from lmdsl.proof.checking import faults
 from lmdsl.proof.cover import Cover
 from lmdsl.proof.images.whole import CellRanges
 from lmdsl.proof.loop import Loop
 from lmdsl.proof.prover import Prover
-from lmdsl.proof.record import Proof
 from lmdsl.results.directory.proved import loop_of
 
 pytestmark = pytest.mark.long  # in other versions it would find nothing else
@@ -113,16 +111,6 @@ def test_a_repair_falls_back_on_the_law_of_sure_arrival(monkeypatch):
     result = lm.solve(made(CIRCLE), proved=0.999)
     assert result.proved.arrives == 1.0
     assert result.verified
-
-
-def proved(result, most):
-    """A proof of at most so many boxes and some more."""
-    loop = loop_of(result)
-    images = loop.images(proving.SLACK, loop.whole(Deadline()))
-    prover = Prover(Cover(loop.partition, loop.status), images, loop.factor, loop.entry(images))
-    prover.run(lambda _: prover.cover.count > most, Deadline(), None)
-    tighten(prover, lambda boxes: boxes > most, Deadline(), None)
-    return loop, Proof.of(proving.boxes(prover), loop, seconds=0.0, holds=None, target=1.0)
 
 
 def at_edges(result, proof, count, rng):

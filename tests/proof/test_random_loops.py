@@ -82,7 +82,7 @@ def random_problem(rng):
 def proved(result, most):
     """A proof of at most so many boxes and some more."""
     loop = loop_of(result)
-    images = loop.images(proving.SLACK)
+    images = loop.images(proving.SLACK, loop.whole(Deadline()))
     prover = Prover(Cover(loop.partition, loop.status), images, loop.factor, loop.entry(images))
     prover.run(lambda _: prover.cover.count > most, Deadline(), None)
     tighten(prover, lambda boxes: boxes > most, Deadline(), None)
