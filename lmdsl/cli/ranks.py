@@ -155,12 +155,11 @@ def _verify(ranks: Ranks, parsed: Arguments) -> int:
 
 def _simulate(ranks: Ranks, parsed: Arguments) -> int:
     """Make runs, divided among the ranks; those that are asked for otherwise by rank 0 alone."""
-    from lmdsl.distributed import simulating
-    from lmdsl.results.result import Result
+    from lmdsl.distributed import loading, simulating
 
     if parsed.given or parsed.parameter or parsed.interpolated or parsed.as_compiled:
         return _by_first(ranks, parsed)
-    law = ranks.agreed(lambda: simulating.stored(Result.load(parsed.dir)))
+    law = simulating.stored(loading.read(ranks, parsed.dir).result)
     with ProgressLine() as progress:
         progress("simulate", -1.0)
         runs = simulating.simulated(ranks, law, parsed.starts, parsed.steps, parsed.seed,

@@ -104,11 +104,8 @@ def _hashes(ranks: Ranks, places: dict[str, Path]) -> dict[str, bytes]:
     """Return the hashes of this rank's share of the blocks of every file, read from the disk."""
     found = {}
     for name, place in places.items():
-        blocks = -(-place.stat().st_size // reading.BLOCK)
-        first, last = (blocks * k // ranks.count for k in (ranks.rank, ranks.rank + 1))
         with open(place, "rb") as file:
-            file.seek(first * reading.BLOCK)
-            found[name] = reading.block_hashes(file.read(reading.BLOCK) for _ in range(first, last))
+            found[name] = reading.share_of_hashes(file, ranks.rank, ranks.count)
     return found
 
 

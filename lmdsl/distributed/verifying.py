@@ -16,6 +16,7 @@ from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.common import inputs
 from lmdsl.common.on_disk import Disk
 from lmdsl.common.types import FilePath, Progress, told
+from lmdsl.distributed import loading
 from lmdsl.distributed.making import AnswerMaker
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.surroundings import own_arithmetic
@@ -75,9 +76,12 @@ def verify(
     def program(ranks: Ranks) -> Verification:
         deadline = ranks.agreed(lambda: Deadline.of(time_limit))
         exactly = ranks.agreed(lambda: inputs.flag(exact, "exact"))
-        stored = ranks.agreed(lambda: archive.read(inputs.path(path)))
-        ranks.alike(stored.certificate.model_dump_json(), "certificates")
-        if exactly or _needs_all(ranks, stored):
+        place = ranks.agreed(lambda: inputs.path(path))
+        whole = exactly or loading.version(ranks, place) != 2
+        stored = None if whole else loading.read(ranks, place)
+        if stored is not None:
+            ranks.alike(stored.certificate.model_dump_json(), "certificates")
+        if stored is None or _needs_all(ranks, stored):
             return by_first(
                 ranks,
                 lambda: verify_alone(

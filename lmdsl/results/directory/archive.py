@@ -206,7 +206,7 @@ def load(path: str | os.PathLike[str]) -> Result:
 
 def read(path: str | os.PathLike[str]) -> Stored:
     """Read a result directory, as :func:`load`, with what else it says."""
-    return reading.read(Path(path), _read)
+    return reading.read(Path(path), of_save)
 
 
 def problem_of(path: str | os.PathLike[str]) -> Problem:
@@ -230,7 +230,11 @@ def read_model(
     return reading.read(Path(path), model)
 
 
-def _read(files: Reading) -> Stored:
+def of_save(files: Reading, share: tuple[int, int] = (0, 1)) -> Stored:
+    """Return what a save holds; controls and statuses are looked at in one of so many shares.
+
+    BadInput: it is unreadable, or inconsistent with its problem.
+    """
     problem = own_problem(files)
     stored = CertificateFile.read(files.certificate)
     partition = Partition.of(problem)
@@ -238,16 +242,22 @@ def _read(files: Reading) -> Stored:
     M = min(control_count(problem), 10**40)
     memory.require(8 * M * (2 + len(problem.control_grid)), "arrays of the result")
     loaded = vectors.read(files, problem, N) | repaired.read(files, stored.proved, N, M)
-    result = _result(problem, partition, stored, loaded)
+    result = _result(problem, partition, stored, loaded, share)
     proved.attach(files.folder, result, stored.proof)
     return Stored(result, stored, tuple(files.rewritten))
 
 
 def _result(
-    problem: Problem, partition: Partition, stored: CertificateFile, loaded: dict[str, NDArray[Any]]
+    problem: Problem,
+    partition: Partition,
+    stored: CertificateFile,
+    loaded: dict[str, NDArray[Any]],
+    share: tuple[int, int],
 ) -> Result:
-    controls = control_vectors(problem)
-    vectors.require_codes(loaded["control_index"], loaded["cell_status"], len(controls))
+    controls, (rank, count) = control_vectors(problem), share
+    part = slice(*(partition.size * k // count for k in (rank, rank + 1)))
+    codes = loaded["control_index"][part], loaded["cell_status"][part]
+    vectors.require_codes(*codes, len(controls))
     said = dict(stored) | loaded
     del said["proof"]  # its keys; the boxes stay in their file
     known: dict[str, Any] = {f.name: said[f.name] for f in fields(Result) if f.name in said}

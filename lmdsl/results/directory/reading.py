@@ -12,7 +12,7 @@ import mmap
 import os
 import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
@@ -76,6 +76,8 @@ class Reading:
         Name and SHA-256 of the other files; empty for a directory of an earlier version.
     rewritten
         Files that somebody wrote anew since the save, as far as they were opened.
+    confirmed
+        Files of which the digests were compared with those of the save, by all ranks together.
     """
 
     def __init__(self, folder: Path, certificate: bytes, stack: ExitStack) -> None:
@@ -83,6 +85,7 @@ class Reading:
         self.certificate = stored(folder, certificate)
         self.save, self.digests = _identity(self.certificate)
         self.rewritten: list[str] = []
+        self.confirmed: frozenset[str] = frozenset()
         self._files: dict[str, BinaryIO | BadInput] = {
             name: self._opened(name) for name in NAMES if name != COMMIT
         }
@@ -95,7 +98,8 @@ class Reading:
         BadInput: it is missing, no regular file, of another save, or larger than ``limit`` bytes.
         """
         found, digest = self._files[name], self.digests.get(name)
-        if digest is not None and not _is(found, digest, limit):
+        known = digest is None or name in self.confirmed
+        if digest is not None and not known and not _is(found, digest, limit):
             hidden = self._opened(f".{name}.{self.save}")
             if _is(hidden, digest, limit):
                 found = hidden
@@ -125,6 +129,19 @@ class Reading:
     def arrays(self, name: str, expected: arrays.Expected) -> dict[str, NDArray[Any]]:
         """Read arrays of an archive of this save."""
         return arrays.unpacked(self.open(name, arrays.largest(expected)), name, expected)
+
+    def apart(self) -> dict[str, BinaryIO]:
+        """Return the files that are hashed by blocks, so that many can share in it."""
+        wanted = (name for name, digest in self.digests.items() if digest.startswith(BLOCKS))
+        found = ((name, self._files[name]) for name in wanted)
+        return {name: file for name, file in found if not isinstance(file, BadInput)}
+
+    def confirm(self, hashes: Mapping[str, bytes]) -> bool:
+        """Compare the hashes of all blocks of the files; return whether they are of this save."""
+        found = {name: of_blocks(held) for name, held in hashes.items()}
+        wanted = {n: digest for n, digest in self.digests.items() if digest.startswith(BLOCKS)}
+        self.confirmed = frozenset(found) if found == wanted else frozenset()
+        return found == wanted
 
     def _opened(self, name: str) -> BinaryIO | BadInput:
         path = self.folder / name
@@ -181,6 +198,14 @@ def _is(file: BinaryIO | BadInput, digest: str, limit: int | None) -> bool:
 def block_hashes(blocks: Iterable[bytes | memoryview]) -> bytes:
     """Return the SHA-256 of every block of a file, one after the other."""
     return b"".join(hashlib.sha256(block).digest() for block in blocks)
+
+
+def share_of_hashes(file: BinaryIO, rank: int, count: int) -> bytes:
+    """Return the SHA-256 of each block of one of ``count`` shares of a file, which ascend."""
+    blocks = -(-_size(file) // BLOCK)
+    first, last = (blocks * k // count for k in (rank, rank + 1))
+    file.seek(first * BLOCK)
+    return block_hashes(file.read(BLOCK) for _ in range(first, last))
 
 
 def of_blocks(hashes: bytes) -> str:
