@@ -13,7 +13,8 @@ from lmdsl.model.grid.boxes import Ends
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.stabilizable_set import CellStatus, sets_of
 from lmdsl.model.successors import counting
-from lmdsl.model.successors.ranges import PathTables, pairwise, taken
+from lmdsl.model.successors.following import PathTables
+from lmdsl.model.successors.ranges import pairwise, taken
 from lmdsl.model.successors.slabs import Slab, Slabs, Span
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem.problem import Problem

@@ -13,6 +13,7 @@ from lmdsl.common.types import Bools, Guard
 from lmdsl.machine import memory
 from lmdsl.machine.kernels import fixed, kernel
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.grid.windows import Window
 
 
 class Table(NamedTuple):
@@ -36,12 +37,16 @@ class Table(NamedTuple):
     stride: NDArray[np.int64]
 
 
-def table(cells: Bools, partition: Partition, guard: Guard | None = None) -> Table:
-    """Return the table of a set of cells, a mask of shape (N,); it can be far larger than that."""
-    d, marked = partition.dimension, cells.reshape(partition.shape)
-    lengths = [n * (2 if p else 1) for n, p in zip(marked.shape, partition.periodic, strict=True)]
+def table(cells: Bools, where: Partition | Window, guard: Guard | None = None) -> Table:
+    """Return the table of a set of cells, a mask of the cells of a box or a window.
+
+    It can be far larger than that. Ranges are those of the box, or have entered the window.
+    """
+    window = where if isinstance(where, Window) else Window.whole(where)
+    marked, turns = cells.reshape(window.shape), [2 if on else 1 for on in window.circles]
+    d, lengths = marked.ndim, [n * k for n, k in zip(marked.shape, turns, strict=True)]
     memory.require(16 * float(np.prod([n + 1.0 for n in lengths])), "sums over the cells")
-    marked = np.tile(marked, [2 if p else 1 for p in partition.periodic])
+    marked = np.tile(marked, turns)
     sums = np.zeros([n + 1 for n in lengths], dtype=np.int64)
     sums[(slice(1, None),) * d] = marked
     for k in range(d):

@@ -19,7 +19,8 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors import counting
 from lmdsl.model.successors.enclosing import StepBoxes, Stretch
-from lmdsl.model.successors.ranges import PathTables, taken
+from lmdsl.model.successors.following import PathTables
+from lmdsl.model.successors.ranges import taken
 from lmdsl.model.successors.slabs import Slabs, met
 from lmdsl.problem.problem import Problem
 

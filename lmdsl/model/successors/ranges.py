@@ -6,12 +6,12 @@ before the modulus. The cells that the image can meet are their product.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Guard, Indices, Progress
+from lmdsl.common.types import Bools, Indices, Progress
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.asked import Asked
@@ -19,8 +19,8 @@ from lmdsl.model.assembly.estimates import Outlook
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors import counting
+from lmdsl.model.successors.following import judging
 from lmdsl.model.successors.slabs import Slab, Slabs, Span, blocks
-from lmdsl.problem.local_control import absorbed_on_way
 from lmdsl.problem.problem import Problem
 
 PAIRS = 2**18  # number of pairs whose ranges are worked on at a time
@@ -46,27 +46,6 @@ class Ranges:
     out: Bools
 
 
-class PathTables(NamedTuple):
-    """The tables of what decides a path, and where one may be put that is in the attractor."""
-
-    avoid: counting.Table
-    attractor: counting.Table
-    absorbed: Indices  # multi-index of a cell of A, shape (d,)
-
-    @classmethod
-    def of(
-        cls, problem: Problem, sets: CellSets, partition: Partition, guard: Guard | None = None
-    ) -> "PathTables":
-        """Return the tables of the sets of a problem."""
-        some = int(np.argmax(sets.attractor))
-        absorbs = absorbed_on_way(problem.local_controller)
-        return cls(
-            counting.table(sets.avoid, partition, guard),
-            counting.table(sets.attractor & absorbs, partition, guard),
-            np.array([int(k[0]) for k in partition.multi_index(np.array([some]))]),
-        )
-
-
 def enclosed(
     problem: Problem,
     partition: Partition,
@@ -74,6 +53,7 @@ def enclosed(
     pairs: tuple[Indices, NDArray[np.integer]],
     deadline: Deadline,
     progress: Progress | None = None,
+    windowed: bool = False,
 ) -> Ranges:
     """Return the ranges of pairs.
 
@@ -85,10 +65,12 @@ def enclosed(
         Cells of the box and controls, ordered by cell, then control.
     deadline, progress
         As for :func:`lmdsl.compile`.
+    windowed
+        Whether sums are made of those cells only that the pairs can meet: of a part of the box.
     """
     grid = Slabs(problem, partition, deadline)
-    judged = PathTables.of(problem, sets, partition, grid.guard)
     cell, control = pairs
+    followed = judging(problem, partition, sets, cell, grid.guard, windowed)
     count, parts, d = len(cell), grid.encloser.parts, partition.dimension
     kind = number_type(partition)
     memory.require(2 * count * parts * d * kind.itemsize, "the successors of all pairs")
@@ -106,11 +88,11 @@ def enclosed(
         for begin in range(start, end, PAIRS):
             some = slice(begin, min(begin + PAIRS, end))
             at = _place(partition, block, cell[some], control[some])
-            lost = np.zeros((len(at[0]), parts), dtype=np.uint8)
+            lost, judge = np.zeros((len(at[0]), parts), dtype=np.uint8), followed()
             for spans, seen in every:
                 first, last, out = taken(spans, at, partition, parts)
                 way = pairwise(seen, at, parts)
-                counting.judge(judged, first, last, out, way, lost)
+                judge(first, last, out, way, lost)
             found.first[some], found.last[some] = first, last
             found.out[some] = (lost == counting.LOST).any(axis=1)
             if admitted is not None:

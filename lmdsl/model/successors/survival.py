@@ -21,9 +21,10 @@ from lmdsl.machine.kernels import fixed
 from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.assembly.transitions import Transitions
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.grid.windows import Window, met
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors.assumed import require_samples_within
-from lmdsl.model.successors.counting import drop, hulls, keep, lift, table
+from lmdsl.model.successors.counting import Table, drop, hulls, keep, lift, table
 from lmdsl.model.successors.ranges import enclosed
 from lmdsl.problem.problem import Problem
 
@@ -38,10 +39,12 @@ class Successors:
     ----------
     admissible
         Which pairs stay in the box and outside avoid, on the whole cell, shape (pairs,).
+    window
+        What ranges of admissible pairs lie in, and are numbered by.
     """
 
     transitions: Transitions
-    partition: Partition
+    window: Window
     admissible: Bools
     _ranges: tuple[NDArray[Any], NDArray[Any]]  # of pairs
     _reach: tuple[NDArray[Any], NDArray[Any]]  # of all pairs of a cell
@@ -57,30 +60,35 @@ class Successors:
         progress: Progress | None = None,
         way: CellSets | None = None,
         cells: Indices | None = None,
+        windowed: bool = False,
     ) -> Self | None:
         """Enclose the images of all pairs of some transitions; None where samples suffice.
 
         ``way`` are the sets that judge the way of steps, where these are others than judge its end;
-        ``cells`` those whose pairs they are, where they are not those of all free cells.
+        ``cells`` those whose pairs they are, where they are not those of all free cells. Then the
+        sets are read in the least window that holds their ranges, if it is ``windowed``.
         """
         if problem.successors != "enclosed":
             return None
         pointer, sets = transitions.pair_pointer, transitions.sets
         cells = sets.free if cells is None else cells
         pairs = cells[owner(pointer)], transitions.control
-        found = enclosed(problem, partition, way or sets, pairs, deadline, progress)
-        first, last = found.first, found.last
+        found = enclosed(problem, partition, way or sets, pairs, deadline, progress, windowed)
+        first, last, admissible = found.first, found.last, ~found.out
+        if "system" in problem.functions:
+            require_samples_within(transitions, partition, (first, last), admissible, cells)
+        window = Window.whole(partition)
+        if windowed:
+            window = Window.around(partition, met(first, last, admissible))
+            window.enter(first, last)
         memory.require(2.0 * first.itemsize * len(cells) * partition.dimension, DOING)
         shape = (len(cells), 1, partition.dimension)
         least, most = (np.zeros(shape, dtype=first.dtype) for _ in range(2))
         hulls(fixed(pointer), fixed(first), fixed(last), least, most)
         ranges, reach = (fixed(first), fixed(last)), (fixed(least), fixed(most))
-        admissible = ~found.out
-        if "system" in problem.functions:
-            require_samples_within(transitions, partition, (first, last), admissible, cells)
         if way is not None:
-            keep(table(sets.avoid, partition), *ranges, admissible)
-        return cls(transitions, partition, admissible, ranges, reach, deadline)
+            keep(table(window.of(sets.avoid), window), *ranges, admissible)
+        return cls(transitions, window, admissible, ranges, reach, deadline)
 
     def choices(self, alive: Bools) -> Indices:
         """Return how many pairs of every cell are alive, shape (F,)."""
@@ -95,7 +103,7 @@ class Successors:
         while lost.any():
             self._guard()
             inside &= ~lost
-            removed = table(self._spread(lost), self.partition, self._guard)
+            removed = self.table(self._spread(lost))
             drop(removed, self._reach, fixed(pointer), self._ranges, alive, choices)
             lost = inside & (choices == 0)
 
@@ -111,24 +119,28 @@ class Successors:
             self._guard()
             chosen = np.zeros(len(level), dtype=np.bool_)
             lift(
-                table(front, self.partition, self._guard),
-                table(self._spread(level < 0) | sets.avoid, self.partition, self._guard),
+                self.table(front),
+                self.table(self._spread(level < 0) | sets.avoid),
                 self._reach, fixed(self.transitions.pair_pointer), self._ranges,
                 fixed(self.admissible), fixed(level), chosen,
             )  # fmt: skip
             below += 1
             level[chosen] = below
             front = self._spread(chosen)
-        sure = np.full(self.partition.size, -1, dtype=np.int32)
+        sure = np.full(self.window.size, -1, dtype=np.int32)
         sure[sets.attractor] = 0
         sure[sets.free] = level
         return sure
+
+    def table(self, cells: Bools) -> Table:
+        """Return the table of marks on the cells of the window."""
+        return table(cells, self.window, self._guard)
 
     def _guard(self) -> None:
         self._deadline.raise_if_over(DOING)
 
     def _spread(self, marked: Bools) -> Bools:
         """Return marked free cells as cells of the box, shape (N,)."""
-        cells = np.zeros(self.partition.size, dtype=np.bool_)
+        cells = np.zeros(self.window.size, dtype=np.bool_)
         cells[self.transitions.sets.free] = marked
         return cells

@@ -30,7 +30,7 @@ from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.verbs import Ranks
 from lmdsl.ranks.watching import Watched
-from lmdsl.slabs.graph.meeting import Marks, OwnSuccessors
+from lmdsl.slabs.graph.meeting import OwnSuccessors
 from lmdsl.systems import MatrixSystem
 
 LOOKED_AT = 64  # cells of which the admissible pairs are counted, to share pairs equally
@@ -97,13 +97,15 @@ def assembled(
             else assemble(problem, partition, deadline=deadline, sets=sets, span=span, disk=disk)
         )
     )
-    met = ranks.agreed(lambda: Successors.asked_for(problem, partition, own, deadline, cells=cells))
+    met = ranks.agreed(
+        lambda: Successors.asked_for(problem, partition, own, deadline, None, None, cells, True)
+    )
     pairs = ranks.agreed(lambda: listed(dropped, len(sets.number), control_count(problem)))
     left = ranks.agreed(lambda: _left(pairs, own, span, ranks.rank == 0))
     mesh = Mesh.of(ranks, division, own.rows.target)
     given = isinstance(problem.system, MatrixSystem)
     rows = replace(own.rows, target=_localised(mesh, own.rows, given), columns=mesh.columns)
-    successors = None if met is None else OwnSuccessors(sets, Marks(ranks, division), met)
+    successors = None if met is None else OwnSuccessors.of(ranks, division, sets, met)
     return OwnPairs(sets, mesh, own.pair_pointer, own.control, own.cost, rows, empty, hold,
                     successors, pairs, left)  # fmt: skip
 
