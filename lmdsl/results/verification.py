@@ -31,8 +31,7 @@ from lmdsl.model.rows import Rows
 from lmdsl.model.sets import CellSets
 from lmdsl.model.stabilizable_set import LOST, CellStatus
 from lmdsl.optimize.feasibility.restriction import restricted
-from lmdsl.results.directory import archive
-from lmdsl.results.directory.audit import differences, local_differences
+from lmdsl.results.directory import archive, audit
 from lmdsl.results.directory.functions import function_differences, function_notes
 from lmdsl.results.directory.proved import proof_findings
 from lmdsl.results.directory.recorded import policy_of
@@ -144,10 +143,7 @@ def verify(
     path = inputs.path(path)
     stored = archive.read(path)
     result, reasons = stored.result, list[str]()
-    notes = [
-        f"{name} was written anew since the save; what it holds now was judged"
-        for name in stored.rewritten
-    ]
+    notes = [audit.REWRITTEN.format(name) for name in stored.rewritten]
     lp = whole = recompiled(path, result, progress, deadline, rows_on_disk)
     in_time()
     if progress:  # told at once, and where an exact judge reads blocks of rows
@@ -159,18 +155,18 @@ def verify(
     lp = _restricted(lp, result, reasons, judge)
     same = archive.names(result, lp)
     if not same:
-        notes.append("the recompiled model differs from the stored one; claims are judged on it")
-    if not _same_cells(lp, result):
-        reasons.append("cell_status differs from the recompiled model")
+        notes.append(audit.OTHER_MODEL)
+    if not same_cells(lp, result):
+        reasons.append(audit.OTHER_CELLS)
     if result.status == Status.NOT_STABILIZABLE:
         certificate = _judge_refusal(lp, result, reasons, judge)
     else:
         certificate = _judge_claims(lp, result, reasons, judge)
         if result.status != Status.VERIFIED:
             reasons.append(f"the status is {result.status}, not verified")
-    reasons += differences(whole, lp, result, stored.certificate, certificate)
+    reasons += audit.differences(whole, lp, result, stored.certificate, certificate)
     in_time()
-    reasons += local_differences(lp, result, stored.certificate, deadline)
+    reasons += audit.local_differences(lp, result, stored.certificate, deadline)
     reasons += proof_findings(path, result, stored.certificate.proof, in_time, notes)
     declared = partial(compile, result.problem, progress, deadline, rows_on_disk=rows_on_disk)
     reasons += repaired.differences(result, stored.certificate.proof, declared, lp, judge, deadline)
@@ -189,7 +185,7 @@ def _restricted(
         return lp
     w = np.where(beyond, result.refusal_vector[lp.cells], 0.0)
     if not (w[beyond] > 0).all() or not judge(lp, Witness(None, refusal=w), 0.0).refusal:
-        reasons.append("that gamma is infeasible from the cells left out is not proved")
+        reasons.append(audit.NOT_REFUSED)
     return restricted(lp, w) or lp
 
 
@@ -211,7 +207,7 @@ def recompiled(
     return replace(lp, problem=problem, cost=cost)
 
 
-def _same_cells(lp: StabilizationLP, result: Result) -> bool:
+def same_cells(lp: StabilizationLP, result: Result) -> bool:
     """Return whether cells are what they were; where none holds, earlier ones had other causes."""
     ours, theirs = lp.cell_status, result.cell_status
     if result.cause == Cause.HOLD:
@@ -224,7 +220,7 @@ def _judge_claims(
 ) -> Certificate:
     policy = policy_of(lp, result)
     if policy is None:
-        reasons.append("control_index is no policy on the stabilizable set")
+        reasons.append(audit.NO_POLICY)
     on = lp.cells
     V_up, W = result.value[on], result.lower[on]
     witness = Witness(policy, result.stability_vector[on], V_up, W, result.measure[on])
@@ -246,7 +242,7 @@ def _judge_refusal(
         Cause.HOLD: holding.none_holds(lp.hold),
     }
     if result.cause is None or not proved[result.cause]:
-        reasons.append(f"the refusal ({result.cause}) is not proved by the recompiled model")
+        reasons.append(audit.UNPROVED.format(result.cause))
     return certificate
 
 

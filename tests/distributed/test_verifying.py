@@ -11,7 +11,7 @@ from saved_results import content, put_apart
 
 import lmdsl as lm
 from lmdsl import distributed
-from lmdsl.distributed.verifying import _same_levels
+from lmdsl.distributed.auditing import same_levels
 from lmdsl.ranks.threaded import as_threads
 from lmdsl.results.directory import reading, vectors
 from lmdsl.slabs import compiling
@@ -160,8 +160,8 @@ def test_enclosed_successors(tmp_path, monkeypatch):
 
     own = lm.Result.load(out)
     lp = as_threads(1, lambda ranks: compiling.compiled(ranks, problem))[0]
-    assert _same_levels(lp, own)
+    assert same_levels(lp, own)
     levels = own.sure_levels.copy()
     levels[-1] += 1
-    assert not _same_levels(lp, replace(own, sure_levels=levels))
-    assert not _same_levels(lp, replace(own, sure_levels=None))
+    assert not same_levels(lp, replace(own, sure_levels=levels))
+    assert not same_levels(lp, replace(own, sure_levels=None))

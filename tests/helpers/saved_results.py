@@ -57,10 +57,12 @@ def put_apart(source, target, **changed):
     """Write a saved result anew, every vector in its own file, digests right."""
     result, about = lm.Result.load(source), json.loads((source / "certificate.json").read_text())
     begun, there = writing.Begun(target), {}
-    for name, kind in vectors.TYPES.items():
+    for name, kind in vectors.types(result.problem).items():
         file = f"{name}.npy"
         held = changed.get(name, content(getattr(result, name), kind))
         begun.path(file).write_bytes(held)
         there[file] = reading.digest_of(file, held)
-    files = {"problem.json": (source / "problem.json").read_bytes()}
+    files = {
+        n: (source / n).read_bytes() for n in ("problem.json", "model.npz") if n in about["files"]
+    }
     begun.finish(files, there, lambda keys: reading.text({**about, **keys}))

@@ -1,7 +1,8 @@
 """What a certificate.json says, compared with what was found anew: every number that is a claim."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from lmdsl.common.records import jsonable
 from lmdsl.control.invariance import SAMPLES, LocalCheck
 from lmdsl.control.staying import check_of
 from lmdsl.machine.deadline import Deadline
+from lmdsl.model.grid.boxes import Area
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.optimize.feasibility import gamma_bar
@@ -21,6 +23,15 @@ from lmdsl.results.directory.recorded import data_differences, policy_of
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.systems import FunctionSystem
+
+# What a verification says, of one process or of many.
+OTHER_MODEL = "the recompiled model differs from the stored one; claims are judged on it"
+OTHER_CELLS = "cell_status differs from the recompiled model"
+OTHER_LEVELS = "sure_levels differ from the recompiled model"
+NO_POLICY = "control_index is no policy on the stabilizable set"
+NOT_REFUSED = "that gamma is infeasible from the cells left out is not proved"
+UNPROVED = "the refusal ({}) is not proved by the recompiled model"
+REWRITTEN = "{} was written anew since the save; what it holds now was judged"
 
 _WEAKER = {"cost": 1e-9, "lower_bound": 1e-9, "gap": 1e-3, "contraction": 1e-9}
 # By how much, relative, a stored number may be weaker than the one proved anew; by how much,
@@ -43,19 +54,28 @@ def differences(
 
     ``whole`` is the recompiled model, ``lp`` the part of it that a restricted result speaks of.
     """
-    reasons = [*counts(_counted(lp), result), *numbers(result, found), *outside(lp, result)]
+    reasons = [*counts(_counted(lp), result), *numbers(result, found)]
+    law = lp.hold is not None and policy_of(lp, result) is not None
+    reasons += said_of(outside(lp, result, law))
     sure = whole.sure_levels
     if sure is not None and not np.array_equal(np.asarray(result.sure_levels), sure):
-        reasons.append("sure_levels differ from the recompiled model")
-    reasons += facts(result, certificate, found, mass(lp, result))
+        reasons.append(OTHER_LEVELS)
+    reasons += facts(result, certificate, found, mass(lp, result), result.beyond_gamma)
     reasons += data_differences(lp, result)
-    return reasons + _bracket(whole, result, found)
+    return reasons + bracket(result, found, whole.gamma, partial(gamma_bar.enclosed, whole))
 
 
 def facts(
-    result: Result, certificate: CertificateFile, found: Certificate, mass: float
+    result: Result,
+    certificate: CertificateFile,
+    found: Certificate,
+    mass: float,
+    beyond: Area | None,
 ) -> list[str]:
-    """Return where a certificate says something else of what needs no model; ``mass`` is of mu."""
+    """Return where a certificate says something else of what needs no model.
+
+    ``mass`` is the sum of mu, ``beyond`` are the cells that the vectors prove infeasible.
+    """
     reasons, claims = list[str](), certificate.claims
     for name in (*(claim.name for claim in CLAIMS), "safe"):
         if claims.get(name) is not getattr(found, name):
@@ -65,8 +85,8 @@ def facts(
         reasons.append("reasons are stored, but the status is verified")
     if result.status != Status.NOT_STABILIZABLE and result.cause is not None:
         reasons.append(f"cause is stored as {result.cause!r}, but nothing was refused")
-    beyond = jsonable(result.beyond_gamma)
-    if "beyond_gamma" in certificate.model_fields_set and certificate.beyond_gamma != beyond:
+    named = certificate.beyond_gamma
+    if "beyond_gamma" in certificate.model_fields_set and named != jsonable(beyond):
         reasons.append("beyond_gamma is not the cells that solution.npz names")
     if "reward" in certificate.model_fields_set:
         reasons += _reward(certificate.reward, result.reward)
@@ -151,42 +171,60 @@ def _residual(mass: float, stored: float | None, found: Certificate) -> list[str
     return [_differs("measure_residual", stored, true)]
 
 
-def outside(lp: StabilizationLP, result: Result) -> list[str]:
-    """Check the arrays where they say that there is nothing: off C, and after a refusal on C."""
+# Of arrays by cell: what they hold on A, off C, and on C where gamma, or all, is refused.
+_NOTHING = (
+    ("value", 0.0, np.inf, np.inf),
+    ("lower", 0.0, np.inf, 0.0),
+    ("measure", 0.0, 0.0, 0.0),
+    ("control_index", -1, -1, -1),
+)
+
+
+def outside(lp: StabilizationLP, result: Result, law: bool) -> list[bool]:
+    """Return which arrays say something where there is nothing: off C, after a refusal on C.
+
+    ``law`` tells whether all cells of C have a control: without one there is none on A either.
+    """
     attractor = lp.cell_status == CellStatus.ATTRACTOR
     off_c = lp.cell_status > CellStatus.STABILIZED
     beyond = lp.cell_status == CellStatus.BEYOND_GAMMA
-    expected: list[tuple[str, float, float, float]] = [  # on A, off C, on C if refused
-        ("value", 0.0, np.inf, np.inf),
-        ("lower", 0.0, np.inf, 0.0),
-        ("measure", 0.0, 0.0, 0.0),
-        ("control_index", -1, -1, -1),
-    ]
-    reasons = []
-    for name, on_attractor, off, refused in expected:
+    wrong = []
+    for name, on_attractor, off, refused in _NOTHING:
         array, on = getattr(result, name), np.full(len(attractor), on_attractor)
-        if name == "control_index" and lp.hold is not None and policy_of(lp, result) is not None:
-            on = lp.hold  # and without a policy there is no law
+        if name == "control_index" and lp.hold is not None and law:
+            on = lp.hold
         sound = (array[attractor] == on[attractor]).all() and (array[off_c] == off).all()
         if result.status == Status.NOT_STABILIZABLE:
             sound = sound and (array[lp.cells] == refused).all()
-        if not sound:
-            reasons.append(f"{name} has a wrong value where there is none to give")
-    if result.witness[attractor | (off_c & ~beyond)].any():
-        reasons.append("witness has a wrong value outside the stabilizable set")
-    return reasons
+        wrong.append(not sound)
+    return [*wrong, bool(result.witness[attractor | (off_c & ~beyond)].any())]
 
 
-def _bracket(whole: StabilizationLP, result: Result, found: Certificate) -> list[str]:
-    """Prove the stored bracket of gamma_bar again, with vectors of our own."""
+def said_of(wrong: Sequence[bool]) -> list[str]:
+    """Return a sentence on every array that :func:`outside` found to be wrong."""
+    sentences = [f"{name} has a wrong value where there is none to give" for name, *_ in _NOTHING]
+    sentences.append("witness has a wrong value outside the stabilizable set")
+    return [sentence for sentence, odd in zip(sentences, wrong, strict=True) if odd]
+
+
+def bracket(
+    result: Result,
+    found: Certificate,
+    gamma: float,
+    enclosed: Callable[[float, float], tuple[float, float]],
+) -> list[str]:
+    """Prove the stored bracket of gamma_bar again, with vectors of our own.
+
+    ``enclosed`` returns a proved one, which lies in the one that it is given if that can be shown.
+    """
     stored = result.gamma_bar
     if stored is None:
         if result.cause == Cause.GAMMA:
             return ["gamma_bar is stored as null, but gamma was refused because of it"]
         return []
-    low, high = gamma_bar.enclosed(whole, *stored)
+    low, high = enclosed(*stored)
     if found.refusal:
-        high = min(high, whole.gamma)
+        high = min(high, gamma)
     if 0 <= stored[0] <= low * (1 + _BRACKET) and stored[1] >= high * (1 - _BRACKET):
         return []
     return [f"gamma_bar is stored as {list(stored)}, but only {[low, high]} is proved"]

@@ -45,6 +45,30 @@ def bracket(lp: StabilizationLP, w: Floats, gathered: int, time_up: TimeUp) -> t
     return low, high
 
 
+def enclosed(
+    lp: StabilizationLP, w: Floats | None, gathered: int, time_up: TimeUp, low: float, high: float
+) -> tuple[float, float]:
+    """Return proved bounds of gamma_bar, within [low, high] where that can be shown; collective.
+
+    ``w`` is a refusal of the gamma of a model, None where there is none. What leads to a bracket of
+    other ranks is the same to the bit only for some numbers of ranks: so the ends that are asked
+    for are aimed at, too, where that does not prove them.
+    """
+    if not First(lp).mesh.division.cells:
+        return 0.0, 0.0
+    found = (0.0, math.inf) if w is None else bracket(lp, w, gathered, time_up)
+    if found[0] < low < math.inf:
+        aimed = replace(lp, gamma=low, _known=lp._algorithm_1)
+        for at, policy, V in beginning.climbing(aimed, gathered, time_up):
+            if at > found[0] and proves_low(lp, policy, V, at):
+                found = at, found[1]
+    if 1 < high < found[1]:
+        refused = refusing.refusal(replace(lp, gamma=high, _known=lp._algorithm_1), time_up)
+        if refused is not None:
+            found = found[0], min(found[1], least_high(lp, refused))
+    return found
+
+
 def proves_low(lp: StabilizationLP, policy: Policy, w: Floats, low: float) -> bool:
     """Return whether w > 0 and low P_u w < w for a policy, read by number; collective."""
     ranks = First(lp).mesh.ranks
