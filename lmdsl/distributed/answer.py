@@ -51,6 +51,10 @@ class Answer(Summary):
     ghosts
         Number of cells of others that ranks keep values of, for each cell of C: what talking costs.
         None where nothing was compiled.
+    ghosts_by_axis
+        About how many they would be, were the box cut along each axis, by name, as some cells tell:
+        what declaring it first would change. Axes with fewer cells than ranks are left out. None
+        with one rank, of one axis, of finite models and recorded data.
     lp
         The model of own cells, as :func:`lmdsl.slabs.compiling.compiled` returns it.
     """
@@ -79,6 +83,7 @@ class Answer(Summary):
     gap_before_polish: None = None
     proof: None = None
     ghosts: float | None = None
+    ghosts_by_axis: dict[str, float] | None = None
     lp: StabilizationLP | None = field(default=None, compare=False)
 
     @property

@@ -17,6 +17,7 @@ from lmdsl.control.invariance import LocalCheck
 from lmdsl.control.staying import check_of
 from lmdsl.data.report import DataReport
 from lmdsl.distributed.answer import Answer
+from lmdsl.distributed.talking import Talk
 from lmdsl.machine.deadline import Deadline, TimeLimitReached
 from lmdsl.model.discretization import control_count, control_vectors
 from lmdsl.model.grid.boxes import Area
@@ -33,7 +34,6 @@ from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.summary import Seconds, Summary
 from lmdsl.slabs import digest
-from lmdsl.slabs.chains.first import First
 from lmdsl.slabs.gamma import whole
 from lmdsl.slabs.gamma.restricting import restricted
 from lmdsl.slabs.solving import Solved
@@ -170,11 +170,12 @@ class AnswerMaker:
             facts["counted"] = Extent.of(result.lp).status
             facts["sure"], facts["area"] = result.sure_cells, result.beyond_gamma
             facts["model_sha256"] = digest.of_model(Alone(), result.lp)
-        facts = self.ranks.share(facts)
+        facts, talk = self.ranks.share(facts), Talk.of(self.lp)
         assert facts is not None
+        facts["message"] = together(facts["message"], talk.note)
         arrays: dict[str, Any] = {name: self._scattered(result, name) for name in ARRAYS}
         return Answer(**facts, **arrays, partition=self.lp.partition, starts=self.starts,
-                      control_vectors=self.lp.controls, ghosts=self._ghosts(),
+                      control_vectors=self.lp.controls, **talk.facts(),
                       lp=self._left(facts, arrays))  # fmt: skip
 
     def _left(self, facts: dict[str, Any], arrays: dict[str, Any]) -> StabilizationLP:
@@ -201,7 +202,7 @@ class AnswerMaker:
         w = witness.w if witness.refusal is None else witness.refusal
         solved = status != Status.NOT_STABILIZABLE
         local, error, data, notes = self._beside(witness)
-        pairs = sum(self.ranks.collect(lp.K))
+        pairs, talk = sum(self.ranks.collect(lp.K)), Talk.of(lp)
         V_up = witness.V_up if proof.upper_bound else None
         return Answer(
             status=status, backend=BACKEND, gamma=lp.gamma,
@@ -212,7 +213,7 @@ class AnswerMaker:
             pairs=pairs, attractor_cells=self.extent.status[CellStatus.ATTRACTOR],
             stabilizable_cells=self.extent.inside, local_controller=local,
             seconds=Seconds(self.compile_seconds, self.solve_seconds, self.verify_seconds),
-            message=together(message, *notes), data=data, integration_error=error,
+            message=together(message, *notes, talk.note), data=data, integration_error=error,
             problem=problem, partition=lp.partition, certificate=proof,
             control_vectors=lp.controls, starts=self.starts, counted=self.extent.status,
             control_index=self._controls(witness), value=self._over(V_up, np.inf, 0.0, np.inf),
@@ -220,7 +221,7 @@ class AnswerMaker:
             measure=self._over(witness.mu, 0.0, 0.0, 0.0), cell_status=lp.cell_status,
             witness=self._over(w, 0.0, 0.0, 0.0), sure_levels=lp.sure_levels, dropped=lp.dropped,
             sure=self._sure(), ended_by_discount=self._ended(witness, proof),
-            model_sha256=digest.of_model(self.ranks, lp), lp=lp, ghosts=self._ghosts(), **more,
+            model_sha256=digest.of_model(self.ranks, lp), lp=lp, **talk.facts(), **more,
         )  # fmt: skip
 
     def _ended(self, witness: Witness, proof: Certificate) -> float | None:
@@ -229,11 +230,6 @@ class AnswerMaker:
         if b is None or self.lp.gamma != 1 or not proof.measure or witness.mu is None:
             return None
         return min(1.0, (1 - b) * math.fsum(self.ranks.collect(math.fsum(witness.mu))))
-
-    def _ghosts(self) -> float:
-        """Return how many cells of others ranks know, for each cell of C; collective."""
-        mesh = First(self.lp).mesh
-        return sum(self.ranks.collect(len(mesh.ghosts))) / max(mesh.division.cells, 1)
 
     def _sure(self) -> int | None:
         levels = self.lp.sure_levels
