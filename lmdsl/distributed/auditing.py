@@ -77,7 +77,8 @@ class OwnPart:
         first, last = (int(n) for n in maker.starts[ranks.rank : ranks.rank + 2])
         arrays = {name: getattr(result, name) for name in VECTORS}
         cut = {name: x[first:last] for name, x in arrays.items() if x is not None}
-        own, pairs = replace(result, **cut), sum(ranks.collect(lp.K))
+        own = replace(result, proof=None, **cut)  # which rank 0 alone reads
+        pairs = sum(ranks.collect(lp.K))
         policy = policy_of(replace(lp, cells=lp.cells - first, _known=lp._algorithm_1), own)
         if policy is None and not lp.n:
             policy = np.empty(0, dtype=np.int64)

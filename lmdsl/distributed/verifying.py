@@ -1,20 +1,21 @@
 """A saved result checked over ranks: each compiles and judges its own cells.
 
 What must hold: the outcome is that of :func:`lmdsl.verify`. Another version of the digest, exact
-arithmetic, proofs, repairs and Python functions are left to rank 0, which checks them as one
-process does. The rest is compared by all (``auditing.py``).
+arithmetic, repairs and Python functions are left to rank 0, which checks them as one process does;
+so are the boxes of a proof. The rest is compared by all (``auditing.py``).
 """
 
 import os
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from lmdsl.certificate.claims import Certificate, Witness
 from lmdsl.common import inputs
 from lmdsl.common.on_disk import Disk
-from lmdsl.common.types import FilePath, Progress, told
+from lmdsl.common.types import FilePath, Guard, Progress, told
 from lmdsl.distributed import auditing, loading
 from lmdsl.distributed.auditing import OwnPart, by_first
 from lmdsl.machine.deadline import Deadline
@@ -25,6 +26,7 @@ from lmdsl.ranks.mpi import at_hand
 from lmdsl.ranks.verbs import Ranks
 from lmdsl.results.directory import audit
 from lmdsl.results.directory.archive import Stored
+from lmdsl.results.directory.proved import proof_findings
 from lmdsl.results.status import Cause, Status
 from lmdsl.results.verification import Verification, same_cells
 from lmdsl.results.verification import verify as verify_alone
@@ -86,7 +88,7 @@ def verify(
                 ),
             )  # fmt: skip
         disk = ranks.agreed(lambda: Disk.of(rows_on_disk))
-        return _verified(ranks, stored, deadline, disk)
+        return _verified(ranks, place, stored, deadline, disk)
 
     return together(everyone, program)
 
@@ -94,11 +96,12 @@ def verify(
 def _needs_all(stored: Stored) -> bool:
     """Return whether something is claimed that is checked on the whole model, or by functions."""
     result = stored.result
-    repaired = stored.certificate.proof is not None or result.proved is not None
-    return bool(result.digest != 2 or result.problem.functions or repaired)
+    return bool(result.digest != 2 or result.problem.functions or result.proved is not None)
 
 
-def _verified(ranks: Ranks, stored: Stored, deadline: Deadline, disk: Disk | None) -> Verification:
+def _verified(
+    ranks: Ranks, path: Path, stored: Stored, deadline: Deadline, disk: Disk | None
+) -> Verification:
     result, problem = stored.result, stored.result.problem
     whole = compiling.compiled(ranks, problem, deadline, disk)
     reasons = list[str]()
@@ -116,13 +119,23 @@ def _verified(ranks: Ranks, stored: Stored, deadline: Deadline, disk: Disk | Non
         certificate = _judged_claims(model, reasons)
         if result.status != Status.VERIFIED:
             reasons.append(f"the status is {result.status}, not verified")
+    in_time = partial(deadline.raise_if_over, "verifying")
     reasons += auditing.differences(model, whole, certificate, deadline)
-    ranks.agreed(partial(deadline.raise_if_over, "verifying"))
+    ranks.agreed(in_time)
     reasons += auditing.local_differences(model, deadline)
+    wrong, noted = by_first(ranks, lambda: _of_proof(path, stored, in_time))
+    reasons += wrong
+    notes += noted
     said = tuple(reasons), tuple(notes)
     found = Verification(not reasons, result.status, same, certificate, *said)
     system = problem.system
     return replace(found, scope=system.scope) if isinstance(system, MatrixSystem) else found
+
+
+def _of_proof(path: Path, stored: Stored, guard: Guard) -> tuple[list[str], list[str]]:
+    """Return what does not hold of the proof of a directory, and what is noted of one that does."""
+    notes = list[str]()
+    return proof_findings(path, stored.result, stored.certificate.proof, guard, notes), notes
 
 
 def _restricted(model: OwnPart, reasons: list[str]) -> OwnPart:

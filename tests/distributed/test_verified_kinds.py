@@ -15,7 +15,7 @@ from verifications import over, require_same, saved, say
 import lmdsl as lm
 from lmdsl.distributed import verifying
 from lmdsl.model.stabilizable_set import CellStatus
-from lmdsl.results.directory import vectors
+from lmdsl.results.directory import proved, vectors
 from lmdsl.slabs import compiling
 from lmdsl.slabs.gamma import whole
 
@@ -64,6 +64,7 @@ KINDS = {
     "all required": lambda: (sampled(9), {"require_all": True}),
     "gamma": lambda: (made(standard_map(8, 9)), {}),
     "restricted": lambda: (sampled(45), {"restrict_to_gamma": True}),
+    "proved": lambda: (cart(HOLD, "enclosed"), {"proved": True}),
     "matrices": lambda: (matrices(), {}),
     "data": lambda: (recorded(), {}),
     "gamma over ranks": lambda: (made(standard_map(8, 9)), {"apart": True}),
@@ -89,10 +90,14 @@ def directory(tmp_path_factory):
     @functools.cache
     def made_of(kind):
         problem, asked = KINDS[kind]()
-        apart = asked.pop("apart", False)
+        apart, proof = asked.pop("apart", False), asked.pop("proved", False)
         with pytest.MonkeyPatch.context() as patch:
             limit(patch, apart)
-            return saved(problem, home / kind.replace(" ", "_"), **asked), apart
+            out = saved(problem, home / kind.replace(" ", "_"), **asked)
+        if proof:
+            result = lm.Result.load(out)
+            proved.add(out, result, result.prove())
+        return out, apart
 
     return made_of
 
@@ -243,6 +248,17 @@ def test_a_local_controller_that_does_less(directory, monkeypatch, tmp_path, nam
         return {"local_controller": {**local, name: "lqr" if name == "kind" else local[name] + 1}}
 
     assert not forged(directory, monkeypatch, tmp_path, "hold enclosed", more).holds
+
+
+@pytest.mark.parametrize(("name", "by"), [("arrives", 0.01), full("boxes", -1), full("steps", 1)])
+def test_a_proof_that_says_more(directory, monkeypatch, tmp_path, name, by):
+    out, _ = directory("proved")
+    assert "proof of the true map" in require_same(out, (2,)).notes[-1]
+
+    def more(said):
+        return {"proof": {**said["proof"], name: said["proof"][name] + by}}
+
+    assert not forged(directory, monkeypatch, tmp_path, "proved", more).holds
 
 
 @pytest.mark.parametrize("share", [0.5, full(0.0), full(1.0)])

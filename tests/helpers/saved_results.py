@@ -62,7 +62,6 @@ def put_apart(source, target, **changed):
         held = changed.get(name, content(getattr(result, name), kind))
         begun.path(file).write_bytes(held)
         there[file] = reading.digest_of(file, held)
-    files = {
-        n: (source / n).read_bytes() for n in ("problem.json", "model.npz") if n in about["files"]
-    }
+    others = [name for name in about["files"] if name not in (*there, vectors.ARCHIVE)]
+    files = {name: (source / name).read_bytes() for name in others}
     begun.finish(files, there, lambda keys: reading.text({**about, **keys}))

@@ -2,6 +2,7 @@
 
 import json
 import re
+from types import SimpleNamespace
 
 import lmdsl as lm
 from lmdsl import distributed
@@ -24,9 +25,22 @@ def said(sentences):
     return [ABOUT.sub("#", sentence) for sentence in sentences]
 
 
+def outcome(work):
+    """What work returns, or what is said where its input is bad."""
+    try:
+        return work(), None
+    except lm.BadInput as error:
+        return None, str(error)
+
+
 def require_same(path, counts=(1, 2, 3, 4)):
-    """Require of so many ranks what one process finds; return that."""
-    one = lm.verify(path)
+    """Require of so many ranks what one process finds, or raises; return that."""
+    one, error = outcome(lambda: lm.verify(path))
+    if error is not None:
+        assert [outcome(lambda c=count: over(c, path))[1] for count in counts] == [error] * len(
+            counts
+        )
+        return SimpleNamespace(holds=False, reasons=[error])
     for count in counts:
         found = over(count, path)
         assert (found.holds, found.status, found.same_model, found.scope) == (
