@@ -159,9 +159,17 @@ def test_what_formulas_yield_is_enclosed(text, x, y, wx, wy, seed):
 
 
 @pytest.mark.long
-@settings(max_examples=5000, deadline=None, derandomize=True)
+@settings(max_examples=2000, deadline=None, derandomize=True)
 @given(texts(), coordinate, coordinate, width, width, st.integers(0, 2**32 - 1))
 def test_what_many_formulas_yield_is_enclosed(text, x, y, wx, wy, seed):
+    compared(text, x, y, wx, wy, seed)
+
+
+@pytest.mark.long
+@pytest.mark.full
+@settings(max_examples=10_000, deadline=None, derandomize=True)
+@given(texts(), coordinate, coordinate, width, width, st.integers(0, 2**32 - 1))
+def test_what_more_formulas_yield_is_enclosed(text, x, y, wx, wy, seed):
     compared(text, x, y, wx, wy, seed)
 
 

@@ -13,7 +13,11 @@ def test_corner_cases(case):
     compare(case)
 
 
-@pytest.mark.parametrize("block", range(10))
+# What other versions of Python and of packages would make of them, two blocks of each tell.
+BLOCKS = [pytest.param(k, marks=[pytest.mark.long] * (k > 1)) for k in range(10)]
+
+
+@pytest.mark.parametrize("block", BLOCKS)
 def test_random_problems(block):
     for i in range(12):
         data = random_problem(np.random.default_rng([block, i]))
@@ -26,7 +30,7 @@ def test_random_problems(block):
 DISCOUNTS = [0.5, 0.9, 0.99, 1 - 2.0**-13, 0.1]
 
 
-@pytest.mark.parametrize("block", range(5))
+@pytest.mark.parametrize("block", BLOCKS[:5])
 def test_random_problems_with_a_discount(block):
     """Some of them without an attractor, some with gamma b >= 1."""
     for i in range(12):

@@ -107,7 +107,7 @@ WALLS = [
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("judged", ["path", "endpoint"])
+@pytest.mark.parametrize("judged", ["path", pytest.param("endpoint", marks=pytest.mark.full)])
 def test_the_published_maze(judged):
     """G. Reissig, A. Weber, M. Rungger's vehicle, 51 x 51 x 35 cells and 15 walls.
 

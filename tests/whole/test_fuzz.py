@@ -51,7 +51,7 @@ def try_file(folder, seed):
 
 
 @pytest.mark.long
-@settings(max_examples=2000, deadline=None, derandomize=True)
+@settings(max_examples=1000, deadline=None, derandomize=True)
 @given(seed=SEEDS)
 def test_spoiled_problem_files(folder, seed):
     try_file(folder, seed)
@@ -59,7 +59,7 @@ def test_spoiled_problem_files(folder, seed):
 
 @pytest.mark.long
 @pytest.mark.full
-@settings(max_examples=2000, deadline=None, derandomize=True)
+@settings(max_examples=4000, deadline=None, derandomize=True)
 @given(seed=st.integers(2**41, 2**50))
 def test_spoiled_problem_files_at_length(folder, seed):
     try_file(folder, seed)

@@ -200,7 +200,7 @@ def try_result(folder, saved, seed):
 
 
 @pytest.mark.long
-@settings(max_examples=600, deadline=None, derandomize=True)
+@settings(max_examples=300, deadline=None, derandomize=True)
 @given(seed=SEEDS)
 def test_spoiled_results(folder, saved, seed):
     try_result(folder, saved, seed)
@@ -208,7 +208,7 @@ def test_spoiled_results(folder, saved, seed):
 
 @pytest.mark.long
 @pytest.mark.full
-@settings(max_examples=600, deadline=None, derandomize=True)
+@settings(max_examples=1200, deadline=None, derandomize=True)
 @given(seed=st.integers(2**41, 2**50))
 def test_spoiled_results_at_length(folder, saved, seed):
     try_result(folder, saved, seed)
