@@ -12,8 +12,8 @@ import numpy as np
 from lmdsl.common.types import Bools, Floats, Guard, Statuses
 from lmdsl.control.steps import Moved
 from lmdsl.machine.kernels import fixed, kernel
-from lmdsl.model.assembly.paths.arcs import free_room
 from lmdsl.model.grid.axis import number_on
+from lmdsl.model.grid.room import free_room
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.model.true_map import TrueMap
 from lmdsl.systems.accurate import ATTEMPTS, AccurateFlow, Arc, place, places

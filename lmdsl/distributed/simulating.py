@@ -28,7 +28,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.forking import cached_property
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local.controller import LocalController
-from lmdsl.model.sets import CellSets
+from lmdsl.model.sets import Mass, scaled
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.problem.problem import Problem
 from lmdsl.ranks.verbs import Ranks
@@ -117,7 +117,7 @@ def _asked(
 
 def _starts(law: Controlled, count: int, rng: np.random.Generator) -> Floats:
     cells = np.flatnonzero(law.cell_status == CellStatus.STABILIZED)
-    weight = CellSets.of(law.problem, law.partition).weight(cells)
+    weight = scaled(Mass(law.problem, law.partition, lambda: None).on(cells))
     if not len(cells) or not weight.any():
         raise BadInput("there is no stabilizable cell to start from")
     return draw_starts(law.partition, cells, weight, count, rng)

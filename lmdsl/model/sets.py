@@ -1,7 +1,7 @@
 """Which cells are attractor, avoid or free, and where the weight m may be positive."""
 
-import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Self
@@ -14,11 +14,17 @@ from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.errors import BadInput
 from lmdsl.machine import memory
 from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.forking import cached_property
 from lmdsl.model.grid import boxes, conditions
 from lmdsl.model.grid.axis import AxisCells
+from lmdsl.model.grid.conditions import OnAxes
+from lmdsl.model.grid.declared_sets import CellBlock, DeclaredSet
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.grid.room import free_room
+from lmdsl.problem.local_control import HoldControl
 from lmdsl.problem.problem import Problem
 from lmdsl.problem.sets import Attractor, Measure
+from lmdsl.systems import MatrixSystem
 
 CELL = 32  # bytes of a cell while the sets are made
 
@@ -37,14 +43,27 @@ class CellSets:
     # shape (N,), int32: position in ``free``; F for the attractor; -1 for avoid
     number: NDArray[np.int32]
 
+    def meet(self, index: Floats | Indices) -> None:
+        """Make known what some cells are, NaN for none: all are known here."""
+
+    def meet_paths(self, state: Floats, slope: Floats) -> None:
+        """Make known what paths lead to, of these places and slopes on the first axis.
+
+        Both are those of the knots, shape (knots, samples); slopes in substeps.
+        """
+
+    def free_before(self, cell: int) -> int:
+        """Return how many cells before one are free."""
+        return int(np.searchsorted(self.free, cell))
+
+    def room(self, partition: Partition) -> NDArray[np.uint8]:
+        """Return the room of cells, shape (N,): :func:`~lmdsl.model.grid.room.free_room`."""
+        free = (self.number >= 0) & ~self.attractor
+        return free_room(free.reshape(partition.shape), partition.periodic)
+
     def weight(self, cells: NDArray[np.integer]) -> Floats:
         """Return m on the cells of C: their mass scaled to sum 1, all zero where they have none."""
-        mass = self.mass[cells]
-        if mass.max(initial=0.0) > 1e290:
-            mass = mass / mass.max()  # the sum would overflow
-        equal = len(mass) > 0 and bool((mass == mass[0]).all())
-        total = len(mass) * float(mass[0]) if equal else math.fsum(mass)  # both correctly rounded
-        return mass / total if total > 0 else np.zeros(len(cells))
+        return scaled(self.mass[cells])
 
     @classmethod
     def of(cls, problem: Problem, partition: Partition, deadline: Deadline | None = None) -> Self:
@@ -60,13 +79,13 @@ class CellSets:
         """
         memory.require(CELL * partition.size, "the sets of cells")
         guard = partial(Deadline.of(deadline).raise_if_over, "compiling")
-        attractor = _attractor(problem, partition, guard)
-        avoid = _avoid(problem, partition, guard)
-        both = np.flatnonzero(attractor & avoid)
-        if len(both):
-            cell = boxes.named(partition, int(both[0]))
-            raise BadInput(f"{cell} is both attractor and avoid; shrink one of them", "avoid")
-        return cls.made(attractor, avoid, _mass(problem, partition, guard))
+        declared = attractor_of(problem, partition, guard)
+        attractor = declared.everywhere()
+        if not (attractor.any() or problem.attractor.empty):
+            raise no_cell(problem.attractor, partition, "attractor")
+        avoid = avoid_of(problem, partition, guard).everywhere()
+        require_apart(partition, np.flatnonzero(attractor & avoid))
+        return cls.made(attractor, avoid, Mass(problem, partition, guard).everywhere())
 
     @classmethod
     def made(cls, attractor: Bools, avoid: Bools, mass: Floats) -> Self:
@@ -78,94 +97,160 @@ class CellSets:
         return cls(attractor, avoid, mass, free, number)
 
 
-def _conditions(problem: Problem, where: str, partition: Partition, guard: Guard) -> Bools:
-    """Return the cells on which a condition of ``attractor`` or ``measure`` certainly holds."""
-    found = np.zeros(partition.size, dtype=np.bool_)
-    for condition in problem.conditions(where):
-        found |= conditions.certain(condition, problem.system.constants(), partition, guard)
-    return found
+def scaled(mass: Floats) -> Floats:
+    """Return masses scaled to sum 1, all zero where they are."""
+    if mass.max(initial=0.0) > 1e290:
+        mass = mass / mass.max()  # the sum would overflow
+    equal = len(mass) > 0 and bool((mass == mass[0]).all())
+    total = len(mass) * float(mass[0]) if equal else math.fsum(mass)  # both correctly rounded
+    return mass / total if total > 0 else np.zeros(len(mass))
 
 
-def _avoid(problem: Problem, partition: Partition, guard: Guard) -> Bools:
-    blocks = (
-        partition.overlapping_box(box, f"avoid.boxes[{i}]")
-        for i, box in enumerate((problem.avoid and problem.avoid.boxes) or ())
-    )
-    mask = partition.mask(blocks, guard)
-    for condition in problem.conditions("avoid"):
-        mask |= conditions.possible(condition, problem.system.constants(), partition, guard)
-    return mask
+def always_whole(problem: Problem) -> bool:
+    """Return whether whoever compiles a part of a problem needs the sets of all cells."""
+    holds = isinstance(problem.local_controller, HoldControl)
+    return isinstance(problem.system, MatrixSystem) or holds
 
 
-def _mass(problem: Problem, partition: Partition, guard: Guard) -> Floats:
-    declared = problem.measure
-    if declared is None:
-        return np.broadcast_to(1.0, partition.size)  # takes no memory
-    mass = np.ones(partition.size)
-    density = problem.density()
-    if declared.weights is not None:
-        if len(declared.weights) != partition.size:
+def require_apart(partition: Partition, both: Indices) -> None:
+    """Refuse a problem of which some cells are both attractor and avoid."""
+    if len(both):
+        cell = boxes.named(partition, int(both[0]))
+        raise BadInput(f"{cell} is both attractor and avoid; shrink one of them", "avoid")
+
+
+class Mass:
+    """The weight of cells before it is intersected with C and scaled: of all, or of some.
+
+    BadInput: there are not as many weights as cells.
+    """
+
+    def __init__(self, problem: Problem, partition: Partition, guard: Guard) -> None:
+        self.problem, self.partition, self.guard = problem, partition, guard
+        self.density = problem.density()
+        weights = None if problem.measure is None else problem.measure.weights
+        if weights is not None and len(weights) != partition.size:
             raise BadInput(
-                f"{len(declared.weights)} weights for {partition.size} cells; give one each",
+                f"{len(weights)} weights for {partition.size} cells; give one each",
                 "measure.weights",
             )
-        mass = np.array(declared.weights)
-    elif density is not None:
-        for start in range(0, partition.size, PART):
-            some = np.arange(start, min(start + PART, partition.size))
-            centres = partition.centres(some)
-            mass[some] = density(dict(zip(partition.names, centres.T, strict=True)), guard)[0]
+        self.weights = None if weights is None else np.array(weights)
+
+    def everywhere(self) -> Floats:
+        """Return the mass of all cells, shape (N,); BadInput: a density is wrong, or all is 0."""
+        N = self.partition.size
+        if self.problem.measure is None:
+            return np.broadcast_to(1.0, N)  # takes no memory
+        mass = np.empty(N)
+        for start in range(0, N, PART):
+            mass[start : start + PART] = self.declared(start)
+        if self.region is not None:
+            mass[~self.region.everywhere()] = 0.0
+        if not mass.any():
+            raise weightless()
+        return mass
+
+    def on(self, cells: Indices) -> Floats:
+        """Return the mass of some cells, ascending ones: as :meth:`everywhere`."""
+        mass = np.ones(len(cells))
+        if self.problem.measure is None:
+            return mass
+        for k in np.unique(cells // PART).tolist():
+            some = slice(*np.searchsorted(cells, (k * PART, (k + 1) * PART)))
+            mass[some] = self.declared(k * PART)[cells[some] - k * PART]
+        if self.region is not None:
+            mass[~self.region.on(cells, self.partition.multi_index(cells))] = 0.0
+        return mass
+
+    def declared(self, start: int) -> Floats:
+        """Return what is declared of ``PART`` cells, of fewer at the end of the box.
+
+        They are always evaluated together: what a density is to the last bit may depend on it.
+        BadInput: the density is negative or not finite in one of them.
+        """
+        some = np.arange(start, min(start + PART, self.partition.size))
+        if self.weights is not None:
+            return self.weights[some]
+        if self.density is None:
+            return np.ones(len(some))
+        centres = self.partition.centres(some)
+        named = dict(zip(self.partition.names, centres.T, strict=True))
+        mass = np.broadcast_to(self.density(named, self.guard)[0], len(some))
         bad = np.flatnonzero(~((mass >= 0) & np.isfinite(mass)))
         if len(bad):
-            cell = boxes.named(partition, int(bad[0]))
+            cell = boxes.named(self.partition, int(some[bad[0]]))
             raise BadInput(
                 f"the density is {float(mass[bad[0]])!r} in {cell}; it must be finite and >= 0",
                 "measure.density",
             )
-    if declared.boxes is not None or declared.where is not None:
-        blocks = (
-            partition.inside_box(box, f"measure.boxes[{i}]")
-            for i, box in enumerate(declared.boxes or ())
-        )
-        inside = partition.mask(blocks, guard)
-        inside |= _conditions(problem, "measure", partition, guard)
-        if not inside.any():
-            raise _no_cell(declared, partition, "measure")
-        mass[~inside] = 0.0
-    if not mass.any():
-        raise BadInput("no cell carries weight; widen the boxes or the density", "measure")
-    return mass
+        return mass
+
+    @cached_property
+    def region(self) -> DeclaredSet | None:
+        """What carries weight; None: all may. BadInput: it has no cell."""
+        declared, partition = self.problem.measure, self.partition
+        if declared is None or (declared.boxes is None and declared.where is None):
+            return None
+
+        def blocks() -> Iterator[CellBlock]:
+            for i, box in enumerate(declared.boxes or ()):
+                yield partition.inside_box(box, f"measure.boxes[{i}]")
+
+        held = _where(self.problem, "measure", partition, self.guard)
+        found = DeclaredSet(partition, blocks, held, self.guard)
+        if found.empty:
+            raise no_cell(declared, partition, "measure")
+        return found
 
 
-def _attractor(problem: Problem, partition: Partition, guard: Guard) -> Bools:
-    declared = problem.attractor
-    points = (
-        partition.around_point(
-            [point[name] for name in partition.names] if isinstance(point, dict) else point,
-            f"attractor.points[{i}]",
-        )
-        for i, point in enumerate(declared.points)
-    )
-    blocks = (
-        partition.inside_box(box, f"attractor.boxes[{i}]") for i, box in enumerate(declared.boxes)
-    )
-    cells = (tuple(np.array([index]) for index in cell) for cell in declared.cells)
+def weightless() -> BadInput:
+    """Return why a problem of which no cell carries weight is refused."""
+    return BadInput("no cell carries weight; widen the boxes or the density", "measure")
+
+
+def attractor_of(problem: Problem, partition: Partition, guard: Guard) -> DeclaredSet:
+    """Return a declared attractor; BadInput: a point or index is outside the box."""
+    declared, names = problem.attractor, partition.names
     for i, cell in enumerate(declared.cells):
         for k, index in enumerate(cell):
             if index >= partition.cells[k]:
                 raise BadInput(
-                    f"index {index} is outside 0..{partition.cells[k] - 1} of axis "
-                    f"{partition.names[k]}",
+                    f"index {index} is outside 0..{partition.cells[k] - 1} of axis {names[k]}",
                     f"attractor.cells[{i}]",
                 )
-    mask = partition.mask(itertools.chain(points, blocks, cells), guard)  # one at a time
-    mask |= _conditions(problem, "attractor", partition, guard)
-    if not (mask.any() or declared.empty):
-        raise _no_cell(declared, partition, "attractor")
-    return mask
+
+    def blocks() -> Iterator[CellBlock]:
+        for i, point in enumerate(declared.points):
+            place = [point[name] for name in names] if isinstance(point, dict) else point
+            yield partition.around_point(place, f"attractor.points[{i}]")
+        for i, box in enumerate(declared.boxes):
+            yield partition.inside_box(box, f"attractor.boxes[{i}]")
+        for cell in declared.cells:
+            yield tuple(np.array([index]) for index in cell)
+
+    return DeclaredSet(partition, blocks, _where(problem, "attractor", partition, guard), guard)
 
 
-def _no_cell(declared: Attractor | Measure, partition: Partition, where: str) -> BadInput:
+def avoid_of(problem: Problem, partition: Partition, guard: Guard) -> DeclaredSet:
+    """Return a declared avoid set."""
+
+    def blocks() -> Iterator[CellBlock]:
+        for i, box in enumerate((problem.avoid and problem.avoid.boxes) or ()):
+            yield partition.overlapping_box(box, f"avoid.boxes[{i}]")
+
+    constants = problem.system.constants()
+    held = [conditions.maybe(c, constants, partition, guard) for c in problem.conditions("avoid")]
+    return DeclaredSet(partition, blocks, tuple(held), guard)
+
+
+def _where(problem: Problem, where: str, partition: Partition, guard: Guard) -> tuple[OnAxes, ...]:
+    """Return where the conditions of ``attractor`` or ``measure`` certainly hold."""
+    constants = problem.system.constants()
+    found = [conditions.surely(c, constants, partition, guard) for c in problem.conditions(where)]
+    return tuple(found)
+
+
+def no_cell(declared: Attractor | Measure, partition: Partition, where: str) -> BadInput:
     """Return why a set that is declared by boxes and conditions has no cell, box by box."""
     faults = []
     for i, box in enumerate(declared.boxes or ()):

@@ -39,7 +39,7 @@ def compiled(
     first own free cell to that of the next rank.
     """
     deadline = Deadline.of(deadline)
-    problem = ranks.agreed(lambda: settled(problem, deadline))
+    problem = _settled(ranks, problem, deadline)
     partition = ranks.agreed(lambda: Partition.of(problem))
     pairs = assembled(ranks, problem, partition, deadline, disk, dropped)
     rows = pairs.rows if problem.ends_in_time else pairs.rows.without_end()
@@ -70,6 +70,16 @@ def compiled(
         mesh=mesh,
         _known=(level, pair if isinstance(kept, slice) else np.searchsorted(kept, pair)),
     )
+
+
+def _settled(ranks: Ranks, problem: Problem, deadline: Deadline) -> Problem:
+    """Return a problem whose substeps are a number, which rank 0 finds; collective."""
+    system: Any = problem.system
+    if getattr(system, "substeps", None) != "auto":
+        return problem
+    found: Any = ranks.agreed(lambda: None if ranks.rank else settled(problem, deadline))
+    count = ranks.share(None if found is None else int(found.system.substeps))
+    return problem.replaced(system=system.replaced(substeps=count))
 
 
 def _per_cell(pair_pointer: Indices, surviving: Bools) -> Indices:
@@ -137,8 +147,13 @@ def _choices(pairs: OwnPairs, found: Stabilizable) -> Indices:
 def _part(pairs: OwnPairs) -> tuple[int, int]:
     """Return the first cell of the own part of the box, and the one after its last."""
     sets, rank, starts = pairs.sets, pairs.mesh.ranks.rank, pairs.mesh.division.starts
-    begins = np.append(sets.free, len(sets.number))  # of the free cells, and the end of the box
-    return int(begins[starts[rank]]) if rank else 0, int(begins[starts[rank + 1]])
+
+    def begins(position: int) -> int:
+        """Return where a free cell is, or the end of the box after the last."""
+        free = sets.free
+        return int(free[position]) if position < len(free) else len(sets.number)
+
+    return begins(int(starts[rank])) if rank else 0, begins(int(starts[rank + 1]))
 
 
 def _weight(ranks: Ranks, sets: CellSets, cells: Indices) -> Floats:

@@ -77,6 +77,7 @@ class Entries:
         if self.terminal is not None:
             index = ends.cell.ravel()
             inside = np.flatnonzero(index >= 0)
+            self.sets.meet(index)
             number = self.sets.number[index[inside].astype(np.int64)]
             absorbed = inside[number == len(self.sets.free)]
             states = self.partition.states(ends.place[:, absorbed].T)

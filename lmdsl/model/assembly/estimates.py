@@ -14,6 +14,7 @@ from lmdsl.model import discretization
 from lmdsl.model.assembly.entries import doubles
 from lmdsl.model.assembly.paths.judging import KEPT
 from lmdsl.model.assembly.sampler import CHUNK, chunk
+from lmdsl.model.sets import always_whole
 from lmdsl.problem.problem import Problem
 
 log = logging.getLogger(__name__)
@@ -101,7 +102,8 @@ def estimate(
     entries = pilot.entries + (problem.discount is not None)
     # Of a pair the row, its end, control and cost; of a cell the sets, levels and weights.
     row = 0.0 if on_disk else 20 + entries * _entry(S)
-    model = N * (64 + pairs * (1 + row)) + (every - N) * SETS
+    others = every - N if always_whole(problem) else min(every - N, N)
+    model = N * (64 + pairs * (1 + row)) + others * SETS
     if problem.successors == "enclosed":
         parts = min(discretization.node_count(problem), 10**40)
         model += N * pairs * (8 + 4 * parts * len(problem.state_box))
@@ -141,7 +143,7 @@ def _entry(S: int) -> int:
 MARGIN = 1.1  # a few cells do not say exactly what all are like, and allocators keep something back
 
 
-SETS = 24  # bytes of a cell of others: whether it is free, its number and mass
+SETS = 24  # bytes of a cell of others that is known: whether it is free, its number and mass
 
 
 OVERHEAD = 2**25  # bytes of code, kernels and tables

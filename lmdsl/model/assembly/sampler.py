@@ -116,17 +116,19 @@ class Sampler:
         self._control = np.ascontiguousarray(self.controls.T)
         self._noise = np.ascontiguousarray(self.nodes.values.T)[:, None, None, :, None]
 
-    def blocks(self, cells: Indices) -> Iterator[Block]:
-        """Yield blocks of about ``chunk`` samples, ordered by cell, then control."""
+    def blocks(self, cells: Indices, span: tuple[int, int] | None = None) -> Iterator[Block]:
+        """Yield blocks of about ``chunk`` samples, ordered by cell, then control.
+
+        Of a span, from a position in ``cells`` to before another, those of all cells that meet it.
+        """
         M = len(self.controls)
         lanes = max(1, self.chunk // self.samples)
-        if lanes >= M:
-            for i in range(0, len(cells), lanes // M):
-                yield Block(i, cells[i : i + lanes // M], (0, M))
-            return
-        for i in range(len(cells)):
-            for a in range(0, M, lanes):
-                yield Block(i, cells[i : i + 1], (a, min(a + lanes, M)))
+        together = max(1, lanes // M)
+        first, last = (0, len(cells)) if span is None else span
+        for i in range(first // together * together, last if last > first else 0, together):
+            some = cells[i : i + together]
+            for a in range(0, M, M if lanes >= M else lanes):
+                yield Block(i, some, (a, M if lanes >= M else min(a + lanes, M)))
 
     def values(self, block: Block) -> dict[str, Floats]:
         """Return named arrays that broadcast to the samples of a block (see the module)."""

@@ -104,7 +104,7 @@ def _assembled(
     span: tuple[int, int],
     disk: Disk | None,
 ) -> Transitions:
-    pilot = _pilot(sampler, sets)
+    pilot = _pilot(sampler, sets, span)
     F, M = span[1] - span[0], len(sampler.controls)
     share = F / max(len(sets.free), 1)
     need = require_room(problem, "estimated from a few cells", disk, pilot, share)
@@ -123,7 +123,7 @@ def _assembled(
     # unless it has seen more than that freed at once.
     np.empty(2**20)
     assembler = Assembler(sampler, sets, shares)
-    parts = (part for part in sampler.blocks(sets.free) if _meets(part, span))
+    parts = sampler.blocks(sets.free, span)
     for block, every in sampler.asked.in_order(assembler, parts, deadline.cancel):
         at, rows = _within(block, every, span)
         pair_pointer[1 + at : 1 + at + len(rows.per_cell)] += rows.per_cell
@@ -146,10 +146,6 @@ def _assembled(
         rows=Rows(pointer.array(), target.array(), code.array(), shares, len(sets.free)),
         cost=cost.array(),
     )
-
-
-def _meets(block: Block, span: tuple[int, int]) -> bool:
-    return max(block.first, span[0]) < min(block.first + len(block.cells), span[1])
 
 
 def _within(block: Block, rows: BlockRows, span: tuple[int, int]) -> tuple[int, BlockRows]:
@@ -187,7 +183,7 @@ class Assembler:
     """Computes the rows of blocks; it may be called from several threads at once."""
 
     def __init__(self, sampler: Sampler, sets: CellSets, shares: Shares) -> None:
-        self.sampler, nodes = sampler, sampler.nodes
+        self.sampler, self.sets, nodes = sampler, sets, sampler.nodes
         self.columns, self.ended = len(sets.free), shares.ended
         sizes = np.bincount(nodes.group) * len(sampler.points)
         first_code = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
@@ -200,6 +196,7 @@ class Assembler:
         """Return a block and its rows; BadInput: a cost is negative or not finite."""
         sampler, lanes = self.sampler, block.lanes
         index, mean = sampler.outcomes(block)
+        self.sets.meet(index)
         rows = BlockRows(
             np.zeros(len(block.cells), dtype=np.int64),
             np.empty(lanes, dtype=np.int32),
@@ -236,13 +233,13 @@ class Assembler:
         return block, BlockRows(per_cell, control, cost, *parts)
 
 
-def _pilot(sampler: Sampler, sets: CellSets) -> Pilot:
-    """Sample a few cells spread over the box."""
-    if not len(sets.free):
+def _pilot(sampler: Sampler, sets: CellSets, span: tuple[int, int]) -> Pilot:
+    """Sample a few cells spread over those that are asked for."""
+    F, M, S = span[1] - span[0], len(sampler.controls), sampler.samples
+    if not F:
         return Pilot()
-    F, M, S = len(sets.free), len(sampler.controls), sampler.samples
     count = max(1, min(64, F, 4 * sampler.chunk // S))
-    cells = sets.free[np.linspace(0, F - 1, count).astype(int)]
+    cells = sets.free[np.linspace(span[0], span[1] - 1, count).astype(int)]
     width = max(1, min(M, 4 * sampler.chunk // (count * S)))
     blocks = [Block(0, cells, (0, M))]
     if width < M:  # another part of the controls for every cell
@@ -258,6 +255,7 @@ def _lengths(sampler: Sampler, sets: CellSets, block: Block) -> Indices:
     index = sampler.images(block, sampler.values(block))
     sampler.guard()
     leaves = np.isnan(index)
+    sets.meet(index)
     target = sets.number[np.where(leaves, 0.0, index).astype(np.int64)]
     target[leaves] = -1
     rows = np.sort(target, axis=1)

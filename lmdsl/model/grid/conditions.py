@@ -42,10 +42,59 @@ PARTS: Final = 2**14
 WORK: Final = 2**23
 
 
+class OnAxes(NamedTuple):
+    """Where a condition holds, by the cells of the axes on which it depends.
+
+    Attributes
+    ----------
+    axes
+        Which axes, ascending.
+    held
+        One entry for each of their cells, flat in C order.
+    """
+
+    axes: tuple[int, ...]
+    held: Bools
+
+    def everywhere(self, partition: Partition) -> Bools:
+        """Return the cells of the box on which it holds, shape (N,)."""
+        spread = [n if k in self.axes else 1 for k, n in enumerate(partition.shape)]
+        return np.broadcast_to(self.held.reshape(spread), partition.shape).ravel()
+
+    def on(self, index: Sequence[Indices], partition: Partition) -> Bools:
+        """Return on which cells it holds, given by their index on every axis."""
+        at = np.zeros(len(index[0]), dtype=np.int64)
+        for k in self.axes:
+            at = at * partition.shape[k] + index[k]
+        return self.held[at]
+
+
 def certain(
     condition: Formula, constants: Mapping[str, float], partition: Partition, guard: Guard
 ) -> Bools:
-    """Return the cells on all of which a condition holds, shape (N,).
+    """Return the cells on all of which a condition holds, shape (N,); see :func:`surely`."""
+    return surely(condition, constants, partition, guard).everywhere(partition)
+
+
+def possible(
+    condition: Formula, constants: Mapping[str, float], partition: Partition, guard: Guard
+) -> Bools:
+    """Return the cells on which a condition may hold somewhere; see :func:`maybe`."""
+    return maybe(condition, constants, partition, guard).everywhere(partition)
+
+
+def maybe(
+    condition: Formula, constants: Mapping[str, float], partition: Partition, guard: Guard
+) -> OnAxes:
+    """Return where a condition may hold somewhere in a cell; see :func:`surely`."""
+    axes, fails = surely(negation(condition), constants, partition, guard)
+    return OnAxes(axes, ~fails)
+
+
+def surely(
+    condition: Formula, constants: Mapping[str, float], partition: Partition, guard: Guard
+) -> OnAxes:
+    """Return where a condition holds on all of a cell.
 
     Parameters
     ----------
@@ -80,15 +129,7 @@ def certain(
             held[some[yes]] = True
             left.append(some[~yes & ~no])
         undecided = np.concatenate([np.zeros(0, dtype=np.int64), *left])
-    spread = [n if k in axes else 1 for k, n in enumerate(partition.shape)]
-    return np.broadcast_to(held.reshape(spread), partition.shape).ravel()
-
-
-def possible(
-    condition: Formula, constants: Mapping[str, float], partition: Partition, guard: Guard
-) -> Bools:
-    """Return the cells on which a condition may hold somewhere; see :func:`certain`."""
-    return ~certain(negation(condition), constants, partition, guard)
+    return OnAxes(tuple(axes), held)
 
 
 class _Verdict(NamedTuple):

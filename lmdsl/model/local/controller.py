@@ -182,7 +182,8 @@ def _inside(orbit: Floats, partition: Partition, attractor: Bools) -> None:
     for k, point in enumerate(orbit):
         where = f"local_controller.orbit[{k}]"
         block = partition.around_point([float(x) for x in point], where)
-        if not attractor[partition.mask([block])].any():
+        cells = np.ravel_multi_index(np.ix_(*block), partition.shape)
+        if not attractor[np.sort(cells, axis=None)].any():
             raise BadInput("the point lies in no attractor cell; add it to the attractor", where)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools
+from lmdsl.machine.forking import cached_property
 from lmdsl.machine.kernels import fixed
 from lmdsl.model.algorithm_1 import owner
 from lmdsl.model.sets import CellSets
@@ -45,7 +46,7 @@ class OwnSuccessors:
     @classmethod
     def of(cls, ranks: Ranks, division: Division, sets: CellSets, own: Successors) -> Self:
         """Agree of which free cells a rank hears: those in the window of its own pairs."""
-        runs = [tuple(np.searchsorted(sets.free, run).tolist()) for run in own.window.runs]
+        runs = [(sets.free_before(a), sets.free_before(b)) for a, b in own.window.runs]
         return cls(sets, Telling.agreed(ranks, division.starts, runs), own)
 
     def remove(self, lost: Bools, alive: Bools, inside: Bools) -> None:
@@ -94,8 +95,12 @@ class OwnSuccessors:
 
     def _spread(self, marked: Bools) -> Bools:
         """Return marked own cells, and those of others, as cells of the window; collective."""
-        window, sets = self.own.window, self.sets
-        cells = np.zeros(window.size, dtype=np.bool_)
-        free = ~(window.of(sets.attractor) | window.of(sets.avoid))
-        cells[free] = self.marks.heard(marked)
+        cells = np.zeros(self.own.window.size, dtype=np.bool_)
+        cells[self._free] = self.marks.heard(marked)
         return cells
+
+    @cached_property
+    def _free(self) -> Bools:
+        """Which cells of the window are free."""
+        window, sets = self.own.window, self.sets
+        return ~(window.of(sets.attractor) | window.of(sets.avoid))

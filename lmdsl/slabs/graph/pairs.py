@@ -22,15 +22,17 @@ from lmdsl.model.grid.partition import Partition
 from lmdsl.model.local import holding
 from lmdsl.model.local.controller import LocalController
 from lmdsl.model.rows import Rows
-from lmdsl.model.sets import CellSets
+from lmdsl.model.sets import CellSets, always_whole
 from lmdsl.model.successors.left_out.dropping import listed, others
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem import Problem
+from lmdsl.problem.local_control import HoldControl
 from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.verbs import Ranks
 from lmdsl.ranks.watching import Watched
 from lmdsl.slabs.graph.meeting import OwnSuccessors
+from lmdsl.slabs.graph.pieces import PieceSets
 from lmdsl.systems import MatrixSystem
 
 LOOKED_AT = 64  # cells of which the admissible pairs are counted, to share pairs equally
@@ -86,8 +88,8 @@ def assembled(
     deadline = Watched(ranks, Deadline.of(deadline))
     ranks.alike((__version__, np.__version__), "versions of lmdsl and NumPy")
     ranks.alike(problem.model_dump_json(), "problems")
-    sets, hold, empty = ranks.agreed(lambda: _sets(problem, partition, deadline))
-    division = ranks.agreed(lambda: divided(problem, partition, sets, ranks.count, deadline))
+    sets, hold, empty = _sets(ranks, problem, partition, deadline)
+    division = divided(ranks, problem, partition, sets, deadline)
     span = division.own(ranks.rank)
     cells = sets.free[slice(*span)]
     own = ranks.agreed(
@@ -111,19 +113,25 @@ def assembled(
 
 
 def _sets(
-    problem: Problem, partition: Partition, deadline: Deadline
+    ranks: Ranks, problem: Problem, partition: Partition, deadline: Deadline
 ) -> tuple[CellSets, holding.Controls | None, bool]:
     """Return the sets that are compiled, the controls of cells that hold, and if none does.
 
-    Every rank makes them: they are small beside the rows.
+    Collective. Where cells hold, or every rank has the whole model anyway, each makes all sets.
     """
     limit = unless_short(problem, deadline)
-    declared = CellSets.of(problem, partition, limit)
-    if problem.local_controller is not None:  # refuse a wrong one before the work
-        LocalController.of(problem, partition, declared.attractor, limit)
-    hold = holding.held(problem, partition, declared, limit)
-    sets = holding.within(declared, problem, hold)
-    return sets, hold, holding.leaves_nothing(problem, hold)
+    local = problem.local_controller
+    if ranks.count == 1 or always_whole(problem):
+        sets = ranks.agreed(lambda: CellSets.of(problem, partition, limit))
+    else:
+        sets = PieceSets.over(ranks, problem, partition, limit)
+    # Refuse a wrong one before the work.
+    if local is not None:
+        ranks.agreed(lambda: LocalController.of(problem, partition, sets.attractor, limit))
+    if not isinstance(local, HoldControl):
+        return sets, None, False
+    hold = ranks.agreed(lambda: holding.held(problem, partition, sets, limit))
+    return holding.within(sets, problem, hold), hold, holding.leaves_nothing(problem, hold)
 
 
 def _left(
@@ -136,6 +144,7 @@ def _left(
     if pairs is None:
         return None
     sets = own.sets
+    sets.meet(pairs[:, 0])
     number = sets.number[pairs[:, 0]]
     strange = (number < 0) | (number >= len(sets.free))
     mine = (number >= span[0]) & (number < span[1]) & ~strange
@@ -155,17 +164,29 @@ def _localised(mesh: Mesh, rows: Rows, given: bool) -> NDArray[np.int32]:
 
 
 def divided(
-    problem: Problem, partition: Partition, sets: CellSets, count: int, deadline: Deadline
+    ranks: Ranks, problem: Problem, partition: Partition, sets: CellSets, deadline: Deadline
 ) -> Division:
-    """Divide the free cells into ranges of about as many admissible pairs each.
+    """Divide the free cells into ranges of about as many admissible pairs each; collective.
 
     These are counted in a few cells that depend on the problem alone, and taken to be the same in
-    the cells around each of them.
+    the cells around each of them. Each rank counts in some that lie side by side.
     """
-    F = len(sets.free)
+    F, count = len(sets.free), ranks.count
     if isinstance(problem.system, MatrixSystem) or not F:
         return Division.cut(np.ones(1, dtype=np.int64), count, np.array([F]))
     some = np.unique(np.linspace(0, F - 1, min(F, LOOKED_AT)).astype(np.int64))
+    own = some[len(some) * ranks.rank // count : len(some) * (ranks.rank + 1) // count]
+    found = np.concatenate(
+        ranks.collect(ranks.agreed(lambda: _counted(problem, partition, sets, own, deadline)))
+    )
+    ends = np.concatenate([(some[1:] + some[:-1]) // 2 + 1, [F]])  # of the cells around each
+    return Division.cut(found, count, np.diff(ends, prepend=0))
+
+
+def _counted(
+    problem: Problem, partition: Partition, sets: CellSets, some: Indices, deadline: Deadline
+) -> Indices:
+    """Return how many pairs of some free cells are admissible, of all controls or of some."""
     sampler = Sampler(problem, partition, deadline, sets=sets)
     M = len(sampler.controls)
     width = max(1, min(M, sampler.chunk // sampler.samples))
@@ -174,8 +195,8 @@ def divided(
         for a in range(0, M, max(width, M // 4)):  # all controls, or some of each quarter
             block = Block(0, np.array([cell]), (a, min(a + width, M)))
             index = sampler.images(block, sampler.values(block))
+            sets.meet(index)
             target = sets.number[np.where(np.isnan(index), 0.0, index).astype(np.int64)]
             target[np.isnan(index)] = -1
             found[at] += int((target >= 0).all(axis=1).sum())
-    ends = np.concatenate([(some[1:] + some[:-1]) // 2 + 1, [F]])  # of the cells around each
-    return Division.cut(found, count, np.diff(ends, prepend=0))
+    return found

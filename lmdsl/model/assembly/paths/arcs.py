@@ -5,13 +5,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lmdsl.common.types import Bools, Floats
+from lmdsl.common.types import Floats
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.axis import number_on
 
 MOST_PARTS = 1_000  # most parts of an arc; else twice as many as its steepest end is cells long
-
-FAR = 8  # number of cells above which distances from what decides a path are not told apart
 
 
 class Arcs(NamedTuple):
@@ -46,7 +44,7 @@ class Ground(NamedTuple):
     number, attractor
         Target of every cell, shape (N,): negative in avoid, ``attractor`` in the attractor.
     room
-        See :func:`free_room`.
+        See :func:`lmdsl.model.grid.room.free_room`.
     forbid
         Whether leaving the box on the way is an escape.
     """
@@ -56,23 +54,6 @@ class Ground(NamedTuple):
     attractor: int
     room: NDArray[np.uint8]
     forbid: bool
-
-
-def free_room(free: Bools, periodic: Bools) -> NDArray[np.uint8]:
-    """Return how near, in cells, something else than a free cell may be to each cell, at most FAR.
-
-    Where it is r, the cells less than r away on every axis are free.
-    """
-    room = np.zeros(free.shape, dtype=np.uint8)
-    inside = free
-    for _ in range(FAR):
-        room += inside
-        for k in range(free.ndim):
-            lines = np.moveaxis(inside, k, 0)
-            first, last = (lines[:1], lines[-1:]) if periodic[k] else (False & lines[:1],) * 2
-            before, after = np.concatenate([last, lines[:-1]]), np.concatenate([lines[1:], first])
-            inside = np.moveaxis(lines & before & after, 0, k)
-    return room.ravel()
 
 
 @kernel

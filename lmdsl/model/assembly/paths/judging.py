@@ -78,12 +78,12 @@ class PathJudge:
     ) -> None:
         self.flow, self.partition, self.endpoint = flow, partition, endpoint
         self.most = KEPT // path_doubles(flow)
-        free = (sets.number >= 0) & ~sets.attractor
+        self.sets = sets
         self.ground = arcs.Ground(
             np.array(partition.axes, dtype=np.float64),
             sets.number,
             len(sets.free) if absorb else NOWHERE,
-            arcs.free_room(free.reshape(partition.shape), partition.periodic),
+            sets.room(partition),
             not partition.clip,
         )
 
@@ -145,6 +145,7 @@ class PathJudge:
             cell = knots[-1]
         else:
             speed, parts = np.zeros((steps, count)), np.zeros(count)
+            self.sets.meet_paths(state[:, 0], slope[:, 0])
             arcs.speeds(state, slope, self.ground.axes, speed, parts)
             arcs.judge(arcs.Arcs(state, slope, knots, speed, parts), self.ground, cell, arc, time)
         place, integral = np.empty((d if places else 0, count)), np.empty(count * integrals)

@@ -1,0 +1,244 @@
+"""The sets of cells, of which a rank makes the pieces that it looks at.
+
+What must hold: of the cells that are known, a rank says what :class:`lmdsl.model.sets.CellSets`
+does, their numbers among all included; a cell is known before it is looked at. Every rank finds the
+same of a cell, as each finds it by itself: only how many cells of each piece are free is told.
+
+A piece is ``PIECE`` consecutive cells. Arrays over the box are addresses: only pages that pieces
+were written to take memory.
+"""
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lmdsl.common.types import Bools, Floats, Guard, Indices
+from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.kernels import kernel
+from lmdsl.model.grid.declared_sets import DeclaredSet
+from lmdsl.model.grid.partition import Partition
+from lmdsl.model.sets import (
+    PART,
+    CellSets,
+    Mass,
+    attractor_of,
+    avoid_of,
+    no_cell,
+    require_apart,
+    weightless,
+)
+from lmdsl.problem.problem import Problem
+from lmdsl.ranks.verbs import Ranks
+from lmdsl.slabs.graph.planes import Planes, untouched
+
+PIECE = 2**10  # cells
+AT_ONCE = 2**8  # pieces that are made at a time
+
+
+class BoxPieces:
+    """What the cells of a box are, piece by piece; several threads may ask at once.
+
+    Attributes
+    ----------
+    partition
+        The cells.
+    number
+        As of :class:`CellSets`, of cells that are known.
+    before
+        How many cells before each piece are free, then of all, shape (pieces + 1,).
+    known
+        Which pieces are known.
+    mass
+        The weight of cells.
+    """
+
+    def __init__(
+        self, partition: Partition, attractor: DeclaredSet, avoid: DeclaredSet, mass: Mass
+    ) -> None:
+        self.partition, self.mass = partition, mass
+        self._attractor, self._avoid = attractor, avoid
+        count = -(-partition.size // PIECE)
+        self.number = untouched(partition.size, np.int32)
+        self.known = np.zeros(count, dtype=np.bool_)
+        self.before: Indices = np.zeros(count + 1, dtype=np.int64)
+        self._lock = threading.Lock()
+
+    @classmethod
+    def of(cls, ranks: Ranks, problem: Problem, partition: Partition, guard: Guard) -> Self:
+        """Return the pieces of a problem, none known yet; collective.
+
+        Raises what :meth:`CellSets.of` does, on every rank: each looks at its share of the box.
+        """
+        attractor = ranks.agreed(lambda: attractor_of(problem, partition, guard))
+        if attractor.empty and not problem.attractor.empty:
+            ranks.agreed(lambda: _refuse(no_cell(problem.attractor, partition, "attractor")))
+        avoid = ranks.agreed(lambda: avoid_of(problem, partition, guard))
+        mass = ranks.agreed(lambda: Mass(problem, partition, guard))
+        made = cls(partition, attractor, avoid, mass)
+        count, r = len(made.known), ranks.rank
+        share = range(count * r // ranks.count, count * (r + 1) // ranks.count)
+        free = np.concatenate(ranks.collect(ranks.agreed(lambda: made._count(share))))
+        if not ranks.any(ranks.agreed(lambda: made._weighed(share))):
+            ranks.agreed(lambda: _refuse(weightless()))
+        made.before = np.append(0, np.cumsum(free)).astype(np.int64)
+        return made
+
+    @property
+    def free(self) -> int:
+        """Number of free cells F."""
+        return int(self.before[-1])
+
+    def meet(self, cells: NDArray[Any]) -> None:
+        """Make known what cells are, given in any order, NaN for none."""
+        wanted = np.zeros(len(self.known), dtype=np.bool_)
+        if touch(np.ascontiguousarray(cells).reshape(-1), PIECE, self.known, wanted):
+            self.make(np.flatnonzero(wanted))
+
+    def meet_range(self, first: int, last: int) -> None:
+        """Make known what the cells first..last-1 are."""
+        pieces = np.arange(first // PIECE, -(-last // PIECE))
+        unknown = pieces[~self.known[pieces]]
+        if len(unknown):
+            self.make(unknown)
+
+    def make(self, pieces: Indices) -> None:
+        """Make some pieces known, ascending ones."""
+        with self._lock:
+            pieces = pieces[~self.known[pieces]]
+            for at in range(0, len(pieces), AT_ONCE):
+                some = pieces[at : at + AT_ONCE]
+                cells = self._cells(some)
+                free, attractor = self._kinds(cells)
+                of_piece = np.repeat(np.arange(len(some)), PIECE)[: len(cells)]
+                within = np.cumsum(free)
+                starts = np.arange(0, len(cells), PIECE)
+                begins: Indices = within[starts] - free[starts]
+                number = (self.before[some] - begins)[of_piece] + within - 1
+                number[~free] = np.where(attractor[~free], self.free, -1)
+                self.number[cells] = number
+                self.known[some] = True
+
+    def chosen(self, positions: Indices) -> Indices:
+        """Return free cells by their positions among all, ascending ones."""
+        piece = np.searchsorted(self.before, positions, side="right") - 1
+        pieces, which = np.unique(piece, return_inverse=True)
+        self.make(pieces)
+        cells = self._cells(pieces)
+        numbers = self.number[cells]
+        cells = cells[(numbers >= 0) & (numbers < self.free)]
+        starts = np.append(0, np.cumsum(self.before[pieces + 1] - self.before[pieces]))
+        at: Indices = starts[which] + positions - self.before[piece]
+        return cells[at]
+
+    def _cells(self, pieces: Indices) -> Indices:
+        cells = (pieces[:, None] * PIECE + np.arange(PIECE)).ravel()
+        return cells[: np.searchsorted(cells, self.partition.size)]
+
+    def _kinds(self, cells: Indices) -> tuple[Bools, Bools]:
+        """Return which cells are free, and which are in the attractor."""
+        index = self.partition.multi_index(cells)
+        attractor, avoid = self._attractor.on(cells, index), self._avoid.on(cells, index)
+        require_apart(self.partition, cells[attractor & avoid])
+        return ~(attractor | avoid), attractor
+
+    def _count(self, share: range) -> Indices:
+        """Return how many cells of each piece of a share are free."""
+        found = [np.zeros(0, dtype=np.int64)]
+        for at in range(share.start, share.stop, AT_ONCE):
+            some = np.arange(at, min(at + AT_ONCE, share.stop))
+            free, _ = self._kinds(self._cells(some))
+            found.append(np.add.reduceat(free, np.arange(0, len(free), PIECE), dtype=np.int64))
+        return np.concatenate(found)
+
+    def _weighed(self, share: range) -> bool:
+        """Return whether a cell of a share carries weight; BadInput: a density is wrong there."""
+        found = self.mass.problem.measure is None
+        last = min(share.stop * PIECE, self.partition.size)
+        for start in range(share.start * PIECE, last if not found else 0, PART):
+            found |= bool(self.mass.on(np.arange(start, min(start + PART, last))).any())
+        return found
+
+
+class _Seen:
+    """An array over cells of which pieces are made once they are looked at."""
+
+    def __init__(self, size: int, read: Callable[[Indices], NDArray[Any]]) -> None:
+        self.size, self.read = size, read
+
+    def __len__(self) -> int:
+        return self.size
+
+    def __getitem__(self, at: Any) -> NDArray[Any]:
+        if isinstance(at, slice):
+            return self.read(np.arange(*at.indices(self.size)))
+        found = self.read(np.atleast_1d(np.asarray(at, dtype=np.int64)))
+        return found if np.ndim(at) else found[0]
+
+
+@dataclass(frozen=True, eq=False)
+class PieceSets(CellSets):
+    """The sets of a problem of which a rank knows the pieces that it has met."""
+
+    pieces: BoxPieces
+    planes: Planes
+
+    @classmethod
+    def over(cls, ranks: Ranks, problem: Problem, partition: Partition, deadline: Deadline) -> Self:
+        """Return the sets of a problem over ranks; collective. Raises as :meth:`CellSets.of`."""
+        pieces = BoxPieces.of(
+            ranks, problem, partition, partial(deadline.raise_if_over, "compiling")
+        )
+
+        def numbers(cells: Indices) -> NDArray[np.int32]:
+            pieces.meet(cells)
+            return pieces.number[cells]
+
+        N, F = partition.size, pieces.free
+        views = (
+            _Seen(N, lambda cells: numbers(cells) == F),
+            _Seen(N, lambda cells: numbers(cells) < 0),
+            _Seen(N, pieces.mass.on),
+            _Seen(F, pieces.chosen),
+        )
+        attractor, avoid, mass, free = (cast(Any, view) for view in views)
+        planes = Planes(partition, pieces.number, F, pieces.meet_range)
+        return cls(attractor, avoid, mass, free, pieces.number, pieces, planes)
+
+    def meet(self, index: Floats | Indices) -> None:
+        """See :meth:`CellSets.meet`."""
+        self.pieces.meet(index)
+
+    def free_before(self, cell: int) -> int:
+        """See :meth:`CellSets.free_before`."""
+        piece = cell // PIECE
+        known = self.avoid[piece * PIECE : cell] | self.attractor[piece * PIECE : cell]
+        return int(self.pieces.before[piece]) + int(len(known) - known.sum())
+
+    def meet_paths(self, state: Floats, slope: Floats) -> None:
+        """See :meth:`CellSets.meet_paths`."""
+        self.planes.meet(state, slope)
+
+    def room(self, partition: Partition) -> NDArray[np.uint8]:
+        """Return the room of the cells that paths have met: see :meth:`CellSets.room`."""
+        return self.planes.room
+
+
+@kernel
+def touch(cells, size, known, wanted):  # type: ignore[no-untyped-def]
+    """Mark the pieces of so many cells that some cells are in, and that are not known."""
+    found = False
+    for k in range(len(cells)):
+        if cells[k] >= 0:  # not NaN
+            piece = np.int64(cells[k]) // size
+            if not known[piece]:
+                wanted[piece] = found = True
+    return found
+
+
+def _refuse(error: Exception) -> None:
+    raise error
