@@ -194,8 +194,8 @@ def forged(directory, monkeypatch, tmp_path, kind, changed, counts=(3,)):
 
 
 WRONG = {
-    "above": lambda low, high: [low * 1.01, high * 1.02],
-    "below": lambda low, high: [low * 0.98, high * 0.99],
+    "above": lambda low, high: [high * 1.01, high * 1.02],
+    "below": lambda low, high: [low * 0.98, low * 0.99],
     "swapped": lambda low, high: [high, low],
     "none": lambda low, high: None,
 }

@@ -8,6 +8,7 @@ import pytest
 from alike import sampled
 from problems import made, standard_map
 from saved_results import content, put_apart
+from verifications import over, require_same
 
 import lmdsl as lm
 from lmdsl import distributed
@@ -17,13 +18,6 @@ from lmdsl.results.directory import reading, vectors
 from lmdsl.slabs import compiling
 
 pytestmark = pytest.mark.long  # in other versions it would find nothing else
-
-
-def over(count, path, **options):
-    """What so many ranks find, all the same."""
-    every = as_threads(count, lambda ranks: distributed.verify(path, ranks=ranks, **options))
-    assert all(found.to_dict() == every[0].to_dict() for found in every)
-    return every[0]
 
 
 def require_alike(path, counts=(1, 2, 3)):
@@ -165,3 +159,24 @@ def test_enclosed_successors(tmp_path, monkeypatch):
     levels[-1] += 1
     assert not same_levels(lp, replace(own, sure_levels=levels))
     assert not same_levels(lp, replace(own, sure_levels=None))
+
+
+def test_a_problem_that_was_written_anew_is_noted(saved, tmp_path):
+    put_apart(saved, tmp_path / "out")
+    place = tmp_path / "out/problem.json"
+    place.write_text(json.dumps(json.loads(place.read_text())))  # in one line
+    one = require_same(tmp_path / "out", (2, 3))
+    assert one.holds
+    assert "problem.json was written anew" in one.notes[0]
+    place.write_text(place.read_text().replace('"gamma": 1.0', '"gamma": 1.01'))
+    assert not require_same(tmp_path / "out", (2, 3)).holds
+
+
+def test_what_one_process_saved_of_ranks_is_checked_by_all(saved, tmp_path, monkeypatch):
+    """Its vectors are in one archive; the digest is that of ranks."""
+    lm.Result.load(saved).save(tmp_path / "out")
+    monkeypatch.setattr("lmdsl.distributed.verifying.verify_alone", None)
+    assert require_same(tmp_path / "out", (2, 3)).holds
+    held = (tmp_path / "out/solution.npz").read_bytes()
+    (tmp_path / "out/solution.npz").write_bytes(held[:-2000] + bytes(1) + held[-1999:])
+    assert not require_same(tmp_path / "out", (2, 3)).holds

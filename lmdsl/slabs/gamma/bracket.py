@@ -24,18 +24,24 @@ from lmdsl.slabs.gamma import refusing
 WIDTH, PROBES = 1e-3, 12  # relative width aimed at, and number of gammas asked for it
 
 
-def bracket(lp: StabilizationLP, w: Floats, gathered: int, time_up: TimeUp) -> tuple[float, float]:
-    """Return proved bounds of gamma_bar from a refusal of the gamma of a model; collective."""
+def bracket(
+    lp: StabilizationLP, w: Floats, gathered: int, time_up: TimeUp,
+    enough: tuple[float, float] = (math.inf, 0.0),
+) -> tuple[float, float]:  # fmt: skip
+    """Return proved bounds of gamma_bar from a refusal of the gamma of a model; collective.
+
+    Ends that are as good as those that are ``enough`` are not improved.
+    """
     low = 0.0
     for at, policy, V in beginning.climbing(lp, gathered, time_up):
         gain = at > low * (1 + WIDTH / 4)
         if proves_low(lp, policy, V, at):
             low = max(low, at)
-        if not gain and low > 1:
+        if (not gain and low > 1) or low >= enough[0]:
             break
     high = min(least_high(lp, w), lp.gamma)
     for _ in range(PROBES):
-        if high <= low * (1 + WIDTH) or low <= 1 or time_up():
+        if high <= max(low * (1 + WIDTH), enough[1]) or low <= 1 or time_up():
             break
         between = math.sqrt(low * high)
         found = refusing.refusal(replace(lp, gamma=between, _known=lp._algorithm_1), time_up)
@@ -56,7 +62,7 @@ def enclosed(
     """
     if not First(lp).mesh.division.cells:
         return 0.0, 0.0
-    found = (0.0, math.inf) if w is None else bracket(lp, w, gathered, time_up)
+    found = (0.0, math.inf) if w is None else bracket(lp, w, gathered, time_up, (low, high))
     if found[0] < low < math.inf:
         aimed = replace(lp, gamma=low, _known=lp._algorithm_1)
         for at, policy, V in beginning.climbing(aimed, gathered, time_up):
