@@ -6,27 +6,24 @@ is known under its Lipschitz constants only, so that the claim is no more than a
 """
 
 from lmdsl.certificate.claims import Safe
-from lmdsl.common.types import Bools, Guard, Policy, Statuses
+from lmdsl.common.types import Bools, Guard, Policy
 from lmdsl.model.lp import StabilizationLP
-from lmdsl.model.stabilizable_set import CellStatus, sets_of
+from lmdsl.model.stabilizable_set import sets_of
 from lmdsl.model.successors.inclusion import Inclusion
 from lmdsl.systems import FunctionSystem
 from lmdsl.systems.named import NotStored
 
 
-def unproved(
-    lp: StabilizationLP, policy: Policy | None, guard: Guard | None = None,
-    status: Statuses | None = None,
-) -> int | None:  # fmt: skip
+def unproved(lp: StabilizationLP, policy: Policy | None, guard: Guard | None = None) -> int | None:
     """Return of how many cells the claim is not proved; None where it is not made.
 
     The work ends with the first ones: there may be more. What rests on a function that was not
-    saved is not found out. ``status`` is that of the whole box, where the model holds a part.
+    saved is not found out.
     """
     if policy is None or lp.problem.successors != "enclosed":
         return None
     try:
-        return int((~kept(lp, policy, guard, status)).sum())
+        return int((~kept(lp, policy, guard)).sum())
     except NotStored:
         return 0
 
@@ -46,13 +43,9 @@ def sentence(cells: int, unsafe: int) -> str:
     )
 
 
-def kept(
-    lp: StabilizationLP, policy: Policy, guard: Guard | None = None, status: Statuses | None = None
-) -> Bools:
+def kept(lp: StabilizationLP, policy: Policy, guard: Guard | None = None) -> Bools:
     """Return from which cells all that a policy can meet is proved to lie in C u A, shape (n,)."""
-    sets = sets_of(lp.cell_status if status is None else status)
+    sets = sets_of(lp.cell_status)
     allowed = sets.attractor.copy()
     allowed[lp.cells] = True
-    if status is not None:
-        allowed |= status == CellStatus.STABILIZED
     return Inclusion(lp.problem, lp.partition, sets, allowed)(lp.cells, lp.control[policy], guard)

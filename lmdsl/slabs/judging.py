@@ -10,14 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lmdsl.certificate import bounds, checks, safety, sums
+from lmdsl.certificate import bounds, checks, sums
 from lmdsl.certificate.bounds import _inflow
 from lmdsl.certificate.claims import Certificate, Found, Witness
 from lmdsl.certificate.judge import OnTrial, certificate
 from lmdsl.common.types import Floats, Policy
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.ranks.reading import Read, added
-from lmdsl.ranks.verbs import RankError, Ranks
+from lmdsl.ranks.verbs import Ranks
+from lmdsl.slabs import safety
 from lmdsl.slabs.graph import levels
 from lmdsl.slabs.graph.levels import OwnRows
 
@@ -144,15 +145,9 @@ class _Judge:
 
         What cells are is asked of their owners, whatever compiling made of them.
         """
-        ranks, lp = self.ranks, self.lp
-        if lp.problem.successors != "enclosed":
+        if self.lp.problem.successors != "enclosed" or policy is None:
             return None
-        parts = ranks.exchange(dict.fromkeys(range(ranks.count), lp.cell_status))
-        status = np.concatenate([*parts.values()])
-        if ranks.any(len(status) != lp.partition.size):
-            raise RankError(f"ranks have {len(status)} of {lp.partition.size} cells of the box")
-        found = ranks.agreed(lambda: safety.unproved(lp, policy, None, status))
-        return sum(k or 0 for k in ranks.collect(found))
+        return safety.unproved(self.ranks, self.lp, policy)
 
     def to_owners(self, x: Floats) -> Floats:
         """Return what all ranks have for own cells, added up."""

@@ -5,17 +5,21 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+import lmdsl as lm
 from lmdsl.machine.kernels import fixed
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.grid.windows import Window, hull, joined, met
+from lmdsl.model.sets import CellSets
 from lmdsl.model.successors import counting
 from lmdsl.model.successors.following import (
     SLACK,
     Following,
     GrowingWindow,
     PathTables,
+    WindowSets,
     WindowTables,
 )
+from lmdsl.model.successors.inclusion import Inclusion
 
 
 def box(shape, periodic):
@@ -196,3 +200,49 @@ def test_a_window_grows_no_more_than_is_asked():
     assert sizes[-1] <= 20 * (1 + 2 / SLACK)
     assert isinstance(known(np.array([0]), np.array([99])), WindowTables)
     assert known(run, run).window.is_whole
+
+
+CORRIDOR = {
+    "format": "lmdsl/1",
+    "system": {"kind": "ode", "derivative": {"x": "cos(a)", "y": "sin(a)"}, "step": 0.5,
+               "substeps": 1},
+    "state_box": {"x": {"low": 0, "high": 3, "cells": 15},
+                  "y": {"low": 0, "high": 3, "cells": 5}},
+    "control_grid": {"a": {"low": -2.4, "high": 2.4, "points": 7}},
+    "attractor": {"boxes": [{"x": [2.4, 3], "y": [1.8, 3]}]},
+    "avoid": {"boxes": [{"x": [1.4, 1.6], "y": [0, 1.2]}]}, "stage_cost": "1",
+    "sampling": {"kind": "grid", "per_axis": 1}, "successors": "enclosed",
+}  # fmt: skip
+AROUND = CORRIDOR | {
+    "system": {"kind": "map", "next": {"x": "x + 0.3*a + 0.1*x*x", "y": "0.8*y"}},
+    "state_box": {"x": {"low": 0, "high": 3, "cells": 15, "periodic": True},
+                  "y": {"low": 0, "high": 3, "cells": 5}},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("data", [pytest.param(CORRIDOR, marks=pytest.mark.long), AROUND])
+def test_pairs_are_judged_in_a_window_as_in_the_box(data):
+    """One by one, or what they need leaves the window: then it does so by the planes noted."""
+    problem, rng = lm.Problem.model_validate(data), np.random.default_rng(1)
+    partition = Partition.of(problem)
+    sets = CellSets.of(problem, partition)
+    allowed = sets.attractor | (rng.random(partition.size) < 0.8) & ~sets.avoid
+    whole = Inclusion(problem, partition, sets, allowed)
+    pairs = [(np.array([c]), np.array([u])) for c in sets.free[::11] for u in (0, 3, 4)]
+    wanted = [bool(whole(*pair)[0]) for pair in pairs]
+    seen = dict.fromkeys([(True, False), (False, False), (True, True), (False, True)], 0)
+    starts = (0, 4, 11) if partition.periodic[0] else (0, 4, 8)
+    for start in starts:
+        window = Window(partition, start, 7)
+        known = WindowSets(window.of(sets.avoid), window.of(sets.attractor))
+        judge = Inclusion(problem, partition, known, window.of(allowed), window)
+        for pair, holds in zip(pairs, wanted, strict=True):
+            judge.left = judge.left[:0]
+            (proved,), (beyond,) = judge.within(*pair)
+            seen[holds, bool(beyond)] += 1
+            if beyond:
+                assert not window.holds(judge.left[:, 0], judge.left[:, 1]).any()
+            else:
+                assert proved == holds
+                assert not len(judge.left)
+    assert min(seen.values()) > 1, seen

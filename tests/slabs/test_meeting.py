@@ -157,9 +157,9 @@ def test_what_is_told_wrong_is_refused(wrong, message):
 
 
 def deaf(telling, own, plain=Telling.heard):
-    """A rank 1 that takes nothing of what other ranks tell."""
+    """A rank 1 that takes nothing of the marks that other ranks tell."""
     heard = plain(telling, own)
-    if telling.ranks.rank == 1:
+    if telling.ranks.rank == 1 and own.dtype == np.bool_:
         number = np.concatenate([np.arange(*run) for run in telling.asked[1]])
         first, last = telling.starts[1:3]
         heard[(number < first) | (number >= last)] = False

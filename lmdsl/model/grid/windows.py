@@ -90,6 +90,8 @@ class Window:
 
     def positions(self, cells: Indices) -> Indices:
         """Return where cells of the box are among its own, -1 where they are not."""
+        if self.is_whole:
+            return cells
         at = cells - self.start * self._plane
         at = np.where(at < 0, at + self.partition.size, at)
         found: Indices = np.where((cells >= 0) & (at < self.size), at, -1)
@@ -101,7 +103,7 @@ class Window:
         if not self.partition.periodic[0]:
             return np.asarray((start >= 0) & (last < self.start + self.planes))
         if self.is_whole:
-            return np.ones(len(first), dtype=np.bool_)
+            return np.ones(first.shape, dtype=np.bool_)
         return np.asarray(start % n + last - first < self.planes)
 
     def enter(self, first: NDArray[Any], last: NDArray[Any]) -> None:

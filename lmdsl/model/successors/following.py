@@ -56,6 +56,13 @@ class PathTables(NamedTuple):
         )
 
 
+class WindowSets(NamedTuple):
+    """What the cells of a window are."""
+
+    avoid: Bools
+    attractor: Bools
+
+
 class WindowTables(NamedTuple):
     """A window, and the tables of its cells."""
 

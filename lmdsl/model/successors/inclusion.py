@@ -7,6 +7,8 @@ could show is shown here as well. A cell is given up where the image of the midd
 allowed.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,10 +18,11 @@ from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.formulas.intervals import Interval
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid.partition import Partition
+from lmdsl.model.grid.windows import Window, joined
 from lmdsl.model.sets import CellSets
 from lmdsl.model.successors import counting
 from lmdsl.model.successors.enclosing import StepBoxes, Stretch
-from lmdsl.model.successors.following import PathTables
+from lmdsl.model.successors.following import Following, PathTables, WindowSets, WindowTables
 from lmdsl.model.successors.ranges import taken
 from lmdsl.model.successors.slabs import Slabs, met
 from lmdsl.problem.problem import Problem
@@ -27,6 +30,7 @@ from lmdsl.problem.problem import Problem
 BOXES = 2**14  # number of boxes times parts of the noise that are enclosed at a time
 CUTS = 2  # number of times that cells are halved along each axis beyond what compiling does
 OPEN = 2**8  # number of open boxes of a cell above which nothing is claimed of it
+BEYOND = 3  # of a step, beside what tables decide: its range leaves the window
 
 
 class _Boxes(NamedTuple):
@@ -59,18 +63,26 @@ class Inclusion:
         What is judged.
     allowed
         Where steps may end, shape (N,): C and A.
+    window
+        Of whose cells alone sets and ``allowed`` are, where it is not the box.
     """
 
     def __init__(
-        self, problem: Problem, partition: Partition, sets: CellSets, allowed: Bools
-    ) -> None:
+        self, problem: Problem, partition: Partition, sets: CellSets | WindowSets, allowed: Bools,
+        window: Window | None = None,
+    ) -> None:  # fmt: skip
         self.partition, self.path = partition, problem.judged == "path"
         grid = Slabs(problem, partition, Deadline())
         self.encloser, self.domains, self.controls = grid.encloser, grid.domains, grid.controls
         self.unit = partition.width / grid.pieces
         self.cuts = sum(int(n).bit_length() - 1 + CUTS for n in grid.pieces)
-        self.judged = PathTables.of(problem, sets, partition)
-        self.others, self.allowed = counting.table(~allowed, partition), allowed
+        self.window = Window.whole(partition) if window is None else window
+        if isinstance(sets, WindowSets):
+            self.judged = PathTables.within(problem, self.window, *sets)
+        else:
+            self.judged = PathTables.of(problem, sets, partition)
+        self.others, self.allowed = counting.table(~allowed, self.window), allowed
+        self.left = np.empty((0, 2), dtype=np.int64)
         self.true_map = grid.encloser.true_map
         self.admitted, self.names = grid.admitted, grid.names
 
@@ -81,17 +93,28 @@ class Inclusion:
 
         The work ends where it is not proved of one: it is of none of those left undecided.
         """
+        return self.within(cell, control, guard)[0]
+
+    def within(
+        self, cell: Indices, control: NDArray[np.integer], guard: Guard | None = None
+    ) -> tuple[Bools, Bools]:
+        """Return the same, and which pairs are not judged, as what they meet leaves the window.
+
+        The planes that these need are noted in ``left``, as runs.
+        """
         proved, boxes = np.ones(len(cell), dtype=np.bool_), self._cells(cell)
-        step = max(1, BOXES // self.encloser.parts)
+        beyond, step = np.zeros(len(cell), dtype=np.bool_), max(1, BOXES // self.encloser.parts)
         for cut in range(self.cuts + 1):
-            decided, refuted = (np.zeros(len(boxes.owner), dtype=np.bool_) for _ in range(2))
+            decided, left, refuted = np.zeros((3, len(boxes.owner)), dtype=np.bool_)
             for start in range(0, len(decided), step):
                 some = slice(start, start + step)
                 part = boxes.some(some)
                 u = self.controls[:, control[part.owner]]
-                decided[some] = self._decided(part, u, guard)
+                decided[some], left[some] = self._decided(part, u, guard)
                 refuted[some] = ~decided[some] & self._refuted(part, u, guard)
-            boxes, refuted = boxes.some(~decided), refuted[~decided]
+            beyond[boxes.owner[left]] = True
+            more = ~decided & ~beyond[boxes.owner]
+            boxes, refuted = boxes.some(more), refuted[more]
             crowded = np.bincount(boxes.owner, minlength=len(cell)) > OPEN
             proved[crowded] = proved[boxes.owner[refuted]] = False
             if not len(boxes.owner) or not proved.all():
@@ -99,7 +122,7 @@ class Inclusion:
             if cut < self.cuts:
                 boxes = boxes.halved(self.unit)
         proved[boxes.owner] = False
-        return proved
+        return proved, beyond
 
     def _refuted(self, boxes: _Boxes, u: Floats, guard: Guard | None) -> Bools:
         """Return for which boxes some noise sends the middle to where it may not.
@@ -113,7 +136,8 @@ class Inclusion:
         images = self.true_map(middle, list(u[:, :, None]), noise, guard)
         shape = (len(boxes.owner), self.encloser.parts)
         cell = self.partition.locate([np.broadcast_to(x, shape) for x in images])
-        lost: Bools = np.any((cell < 0) | ~self.allowed[cell], axis=1)
+        at = self.window.positions(cell)
+        lost: Bools = np.any((cell < 0) | ((at >= 0) & ~self.allowed[at]), axis=1)
         return lost
 
     def _cells(self, cell: Indices) -> _Boxes:
@@ -130,28 +154,36 @@ class Inclusion:
         high = np.stack([domain.high[at] for domain, at in axes], axis=-1)
         return _Boxes(low, high, owner, place)
 
-    def _decided(self, boxes: _Boxes, u: Floats, guard: Guard | None) -> Bools:
+    def _decided(self, boxes: _Boxes, u: Floats, guard: Guard | None) -> tuple[Bools, Bools]:
+        """Return which boxes are decided, and of which something leaves the window."""
         count, parts = len(boxes.owner), self.encloser.parts
         ends = zip(boxes.low.T, boxes.high.T, strict=True)
         states = [Interval(low[:, None], high[:, None]) for low, high in ends]
         controls = list(u[:, :, None])
         noise = [Interval(w.low[None], w.high[None]) for w in self.encloser.noise]
         every = StepBoxes(states, controls, noise)
-        lost = np.zeros((count, parts), dtype=np.uint8)
+        lost, judge = np.zeros((count, parts), dtype=np.uint8), self._judging()
         for stretch in self.encloser.path(every, guard) if self.path else ():
-            self._met(stretch, boxes.place, lost)
-        first, last = self._met(self.encloser.images(every, guard), boxes.place, lost)
-        kept: Bools = np.all(lost != counting.LOST, axis=1)
+            self._met(stretch, boxes.place, judge, lost)
+        first, last = self._met(self.encloser.images(every, guard), boxes.place, judge, lost)
+        self.window.enter(first, last)
+        kept: Bools = np.all(lost <= counting.ABSORBED, axis=1)
         counting.keep(self.others, first, last, kept)
         if self.admitted is not None:
             points = map(Interval.point, controls)
             values = dict(zip(self.names, (*states, *points), strict=True))
             surely = self.admitted.decide(values, guard)[0][0]
             kept = kept & np.broadcast_to(surely, (count, 1))[:, 0]
-        return kept
+        return kept, np.any(lost == BEYOND, axis=1)
+
+    def _judging(self) -> Callable[..., None]:
+        """Return what judges the stretches of some boxes."""
+        if self.window.is_whole:
+            return partial(counting.judge, self.judged)
+        return Following(lambda *_: WindowTables(self.window, self.judged)).judge
 
     def _met(
-        self, stretch: Stretch, place: Indices, lost: NDArray[np.uint8]
+        self, stretch: Stretch, place: Indices, judge: Callable[..., None], lost: NDArray[np.uint8]
     ) -> tuple[NDArray[Any], NDArray[Any]]:
         """Judge a stretch; return the ranges that it meets, shape (B, parts, d) each."""
         axes = range(self.partition.dimension)
@@ -161,5 +193,10 @@ class Inclusion:
         first, last, out = taken(spans, at, self.partition, self.encloser.parts)
         judged = np.asarray(False if stretch.judged is None else stretch.judged)
         way = np.ascontiguousarray(np.broadcast_to(judged, out.shape))
-        counting.judge(self.judged, first, last, out, way, lost)
+        if not self.window.is_whole:
+            going = (lost == counting.GOING) & ~out
+            left = going & ~self.window.holds(first[..., 0], last[..., 0])
+            lost[left] = BEYOND
+            self.left = np.append(self.left, joined(first[left, 0], last[left, 0]), axis=0)
+        judge(first, last, out, way, lost)
         return first, last
