@@ -143,7 +143,7 @@ def test_ranges_one_plane_off_count_other_cells(off, wanted):
 class Plain:
     """What decides of a problem whose local controller absorbs."""
 
-    local_controller = None
+    local_controller, judged = None, "path"
 
 
 class Marked:

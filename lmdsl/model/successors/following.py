@@ -48,10 +48,11 @@ class PathTables(NamedTuple):
 
         See :class:`Following`.
         """
-        absorbs = absorbed_on_way(problem.local_controller)
+        absorbs = problem.judged == "path" and absorbed_on_way(problem.local_controller)
+        lost = counting.table(avoid, window, guard)
         return cls(
-            counting.table(avoid, window, guard),
-            counting.table(attractor & absorbs, window, guard),
+            lost,
+            counting.table(attractor, window, guard) if absorbs else lost,  # which none stays in
             np.zeros(window.partition.dimension, dtype=np.int64),
         )
 
