@@ -64,7 +64,7 @@ def check(
         share = found.coverage if found.coverage_cells == own else None
         findings += _of_the_map(survey, share, deadline)
         findings += sizes.shrinking(problem, known, deadline)
-        notes += targets.shrunk(problem, partition)
+        notes += [*targets.shrunk(problem, partition), *declaration.axis_order(survey)]
     findings += [*targets.little(problem, known, deadline), *sizes.too_large(found)]
     return CheckReport(tuple(findings), found, own, tuple(notes))
 

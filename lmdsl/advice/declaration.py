@@ -1,4 +1,4 @@
-"""Findings about what is declared: names that nothing uses, angles, and their units."""
+"""Findings about what is declared: names that nothing uses, angles, their units, order."""
 
 import math
 import re
@@ -6,16 +6,21 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from lmdsl.advice.report import Finding
+from lmdsl.advice.survey import Survey
 from lmdsl.explanation import remedies
 from lmdsl.explanation.trials import MapTrial
 from lmdsl.machine.deadline import Deadline
 from lmdsl.problem.problem import Problem
+from lmdsl.slabs.graph import cuts
 from lmdsl.systems import MatrixSystem
 from lmdsl.systems.named import NamedSystem
 
 NAME = re.compile(r"[A-Za-z_]\w*")
 TURN = remedies.TURN
 SLACK = 1e-6  # part of a turn
+RANKS = 4  # of which it is told what they know of each other's cells
+CLEARLY = 1 / 2  # the part of that for which axes are reordered: what is in C is not known yet
+FEW = 5  # blocks of an axis below which they tell too little
 
 
 def unused(problem: Problem) -> Iterator[Finding]:
@@ -193,3 +198,27 @@ def _coordinates(problem: Problem) -> Iterator[tuple[str, str, float]]:
         for name, ends in box.items():
             for k, value in enumerate(ends):
                 yield f"attractor.boxes[{i}].{name}[{k}]", name, float(value)
+
+
+def axis_order(survey: Survey) -> Iterator[Finding]:
+    """Find that over ranks another axis should be declared first, of as many cells as a survey."""
+    p = survey.partition
+    if p.size < cuts.LARGE or isinstance(survey.problem.system, MatrixSystem):
+        return
+    blocks = cuts.Blocks.of(p, survey.count)
+    if any(b < min(n, FEW) for b, n in zip(blocks.shape, p.shape, strict=True)):
+        return
+    counted = cuts.ghosts(blocks, survey.looked(blocks), RANKS)
+    found = cuts.better(p, counted, CLEARLY)
+    if found is None:
+        return
+    name, few, now = found
+    told = ", ".join(f"{x:.2g} along {axis}" for axis, x in counted.items())
+    yield Finding(
+        "axis_order",
+        "state_box",
+        f"over {RANKS} ranks, which divide the cells along the first axis, each would know about "
+        f"{now:.2g} cells of others for each own one ({told}); one process does not care",
+        f"declare {name} first in state_box: then about {few:.2g}",
+        {"ranks": RANKS, "by_axis": counted, "axis": name, "now": now, "then": few},
+    )

@@ -10,6 +10,7 @@ from lmdsl.machine.deadline import Deadline
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import CellSets
 from lmdsl.problem.problem import Problem
+from lmdsl.slabs.graph.cuts import Blocks, Looked
 
 # Number of cells that are tried, and of operations above which they are fewer.
 LEAST_CELLS, MOST_CELLS, WORK = 64, 1024, 1e9
@@ -122,3 +123,44 @@ class Survey(Variant):
                 away = away - np.round(away / self.span[k]) * self.span[k]
             np.fmax(far, np.abs(away) / self.partition.width[k], out=far)
         return np.asarray(np.median(far.max(axis=1), axis=(1, 2)))
+
+    def looked(self, blocks: Blocks) -> Looked:
+        """Return which middles are free and have an admissible pair, and where these pairs lead."""
+        middles, size = blocks.middles, self.partition.size
+        block = np.flatnonzero(self._free(middles))
+        pairs, keys = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+        with np.errstate(all="ignore"):
+            for cells in self.batches(middles[block]):
+                to, inside = self._targets(cells)
+                led = inside[:, :, None, None] & self._free(to)
+                whose = np.nonzero(led)[0] + sum(map(len, pairs))
+                pairs.append(inside.sum(axis=1))
+                keys.append(np.unique(whose * size + to[led]))
+        each = np.concatenate(pairs)
+        source, target = np.divmod(np.concatenate(keys), size)
+        some, number = np.flatnonzero(each), np.cumsum(each > 0) - 1
+        return Looked(block[some], each[some], number[source], target)
+
+    def _targets(self, cells: Indices) -> tuple[Indices, Bools]:
+        """Return where samples of cells end, shape (cells, controls, points, nodes), -1 outside.
+
+        And of which pairs none leaves, or ends in a cell to avoid.
+        """
+        state, controls = self.start(cells), self.vectors()
+        to = self.partition.locate(self.images(state, controls))
+        stays: Bools = to >= 0
+        admitted = self.admits(state, controls)
+        if admitted is not None:
+            stays = stays & admitted
+        if self.sets is not None:
+            stays = stays & (self.sets.number[to] >= 0)
+        shape = self.shape(cells)
+        inside = np.asarray(np.broadcast_to(stays, shape).all(axis=(2, 3)))
+        return np.broadcast_to(to, shape), inside
+
+    def _free(self, cells: Indices) -> Bools:
+        """Return which cells lie outside attractor and avoid, all where that is not known."""
+        if self.sets is None:
+            return np.ones(cells.shape, dtype=np.bool_)
+        number = self.sets.number[cells]
+        return np.asarray((number >= 0) & (number < len(self.sets.free)))

@@ -53,8 +53,9 @@ class Answer(Summary):
         None where nothing was compiled.
     ghosts_by_axis
         About how many they would be, were the box cut along each axis, by name, as some cells tell:
-        what declaring it first would change. Axes with fewer cells than ranks are left out. None
-        with one rank, of one axis, of finite models and recorded data.
+        what declaring it first would change. Of more than 16 ranks, what 16 would know; axes with
+        fewer cells are left out. None with one rank, of one axis, of finite models and recorded
+        data.
     lp
         The model of own cells, as :func:`lmdsl.slabs.compiling.compiled` returns it.
     """

@@ -20,7 +20,7 @@ class Talk(NamedTuple):
         mesh = First(lp).mesh
         ghosts = sum(mesh.ranks.collect(len(mesh.ghosts))) / max(mesh.division.cells, 1)
         by_axis = looking.ghosts_by_axis(lp)
-        return cls(ghosts, by_axis, cuts.sentence(lp.partition, by_axis))
+        return cls(ghosts, by_axis, cuts.sentence(lp.partition, by_axis, mesh.ranks.count))
 
     def facts(self) -> dict[str, Any]:
         """Return attributes of the answer."""

@@ -60,6 +60,18 @@ def test_a_shift_along_one_axis(count):
     assert counted(lp, count) == pytest.approx(found)
 
 
+def test_of_many_controls_those_that_lead_far_are_looked_at(monkeypatch):
+    """Of 101 that move it by at most 5 cells four are taken, the first and the last among them."""
+    monkeypatch.setattr(looking, "MOST_PAIRS", 4)
+    far = shifted().replaced(
+        control_grid={"u": {"low": 1, "high": 5, "points": 101}},
+        system={"kind": "map", "next": {"x": "x + u", "y": "y"}},
+    )
+    lp = local(lm.compile(far))
+    assert lp.pair_pointer[1] == 101
+    assert looking.estimated(lp, 2) == {"x": pytest.approx(5 / 24), "y": 0}
+
+
 def test_the_table_of_the_benchmark(monkeypatch, capsys, tmp_path):
     """Counted, and told by some cells."""
     shifted().save(tmp_path / "shift.json")
@@ -131,13 +143,21 @@ def test_slabs_have_about_equal_numbers_of_pairs():
     assert along.cuts(looked.pairs, 2).tolist() == [0, 5, 10]
 
 
-def test_many_slabs_are_told_by_some():
-    partition = grid((120, 30))
-    at = np.arange(partition.size)
-    rows = [[cell] for cell in np.minimum(at // 30 + 1, 119) * 30 + at % 30]
-    found = cuts.ghosts(*all_cells(partition, rows), 60)
-    assert [*found] == ["x"]  # y has fewer planes than there are slabs
-    assert found["x"] == pytest.approx(59 * 30 / 3600, rel=0.05)
+def test_axes_with_fewer_planes_than_slabs_are_left_out():
+    partition = grid((12, 5, 6))
+    blocks, looked = all_cells(partition, [[cell] for cell in range(360)])
+    assert [[*cuts.ghosts(blocks, looked, count)] for count in (5, 6, 12, 13)] == [
+        ["x", "y", "z"], ["x", "z"], ["x"], [],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("count", [2, 16, 17, 4000])
+def test_of_many_ranks_it_is_told_what_some_would_know(count):
+    said = cuts.sentence(grid((400, 400)), {"x": 0.8, "y": 0.4}, count)
+    few = min(count, 16)
+    assert said.startswith(f"declare y first in state_box: {few} ranks would know about 0.4 ")
+    assert cuts.sentence(grid((300, 300)), {"x": 0.8, "y": 0.4}, count) == ""
+    assert cuts.sentence(grid((400, 400)), None, count) == ""
 
 
 @pytest.mark.parametrize(("shape", "most", "blocks"), [
@@ -200,14 +220,12 @@ def test_the_same_cells_are_looked_at_by_any_number_of_ranks(count):
     assert as_threads(count, program) == [expected] * count
 
 
-SAID = "declare y first in state_box: ranks would know about 0 cells of others for each own one"
-
-
 def test_all_ranks_say_which_axis_to_declare_first(monkeypatch):
     monkeypatch.setattr(cuts, "LARGE", 324)
     for count in (1, 2, 3):
         every = answers(shifted(), count)
-        told = f"{SAID} instead of {(count - 1) / 8:.2g}"
+        told = (f"; declare y first in state_box: {count} ranks would know about 0 cells of others "
+                f"for each own one instead of {(count - 1) / 8:.2g}")  # fmt: skip
         for each in every:
             assert each.message.endswith(told) == (count > 1)
             assert each.message.count("; declare") == (count > 1)
@@ -263,3 +281,12 @@ def test_what_is_worth_a_word(counted, said):
     named = dict(zip("xyz", "yzv", strict=True))
     told = cuts.better(moved, {named[x]: n for x, n in counted.items()})
     assert told == (said and (named[said[0]], *said[1:]))
+
+
+@pytest.mark.parametrize(("counts", "blocks", "pairs"), [
+    ((10**6, 10**6, 10**7, 2 * 10**7), 4096, 64), ((10**6, 10**5, 10**6, 10**6), 40960, 64),
+    ((10**6, 100, 100, 100), 65536, 64), ((10**9, 10**9, 10**12, 10**13), 256, 51),
+    ((10**6, 10**6, 10**9, 10**13), 256, 4),
+])  # fmt: skip
+def test_few_cells_are_looked_at_whatever_the_size(counts, blocks, pairs):
+    assert looking._wanted(*counts) == (blocks, pairs)

@@ -11,6 +11,7 @@ number of ghosts itself, of slabs that are whole planes.
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ import numpy as np
 from lmdsl.common.types import Floats, Indices
 from lmdsl.model.grid.partition import Partition
 
-MOST_SLABS = 16  # slabs whose ghosts are counted, evenly chosen among more
+MOST_SLABS = 16  # beyond, slabs are thinner than blocks, and what these cover is far too much
 CLEARLY, WORTH = 2 / 3, 0.05  # the part of ghosts, and how many fewer, for which axes are reordered
 LARGE = 10**5  # number of cells from which the order of axes is worth a word
 
@@ -92,14 +93,13 @@ def ghosts(blocks: Blocks, looked: Looked, count: int) -> dict[str, float]:
     partition, volume = blocks.partition, blocks.volume(looked.block)
     if not len(looked.block):
         return {}
-    slabs = np.unique(np.linspace(0, count - 1, min(count, MOST_SLABS)).round().astype(int))
     found = {}
     for k, planes in enumerate(partition.shape):
         if planes >= max(count, 2):
             along = _Along(blocks, looked, volume, k)
-            cuts = along.cuts(looked.pairs, count)
-            some = math.fsum(along.ghosts(*cuts[r : r + 2].tolist()) for r in slabs)
-            found[partition.names[k]] = float(some * count / len(slabs) / volume.sum())
+            cuts = along.cuts(looked.pairs, count).tolist()
+            known = math.fsum(along.ghosts(a, b) for a, b in pairwise(cuts))
+            found[partition.names[k]] = known / float(volume.sum())
     return found
 
 
@@ -181,7 +181,9 @@ class _Along:
         return found + self.plane[column, at] * (plane - self.edges[at])
 
 
-def better(partition: Partition, counted: dict[str, float]) -> tuple[str, float, float] | None:
+def better(
+    partition: Partition, counted: dict[str, float], clearly: float = CLEARLY
+) -> tuple[str, float, float] | None:
     """Return the axis to declare first, its ghosts, and those of the one that is; None: no matter.
 
     Cells are cut along the first axis that has more than one.
@@ -191,16 +193,19 @@ def better(partition: Partition, counted: dict[str, float]) -> tuple[str, float,
         return None
     best = min(counted, key=counted.__getitem__)
     few, now = counted[best], counted[first]
-    return (best, few, now) if few < CLEARLY * now and now - few > WORTH else None
+    return (best, few, now) if few < clearly * now and now - few > WORTH else None
 
 
-def sentence(partition: Partition, counted: dict[str, float] | None) -> str:
-    """Return which axis to declare first, where that makes a large problem clearly less talk."""
+def sentence(partition: Partition, counted: dict[str, float] | None, count: int) -> str:
+    """Return which axis to declare first, where so many ranks then have clearly fewer ghosts.
+
+    Empty where they have not, and of a small problem.
+    """
     found = better(partition, counted or {}) if partition.size >= LARGE else None
     if found is None:
         return ""
     name, few, now = found
     return (
-        f"declare {name} first in state_box: ranks would know about {few:.2g} cells of others for "
-        f"each own one instead of {now:.2g}"
+        f"declare {name} first in state_box: {min(count, MOST_SLABS)} ranks would know about "
+        f"{few:.2g} cells of others for each own one instead of {now:.2g}"
     )

@@ -10,15 +10,15 @@ from lmdsl.systems import MatrixSystem
 
 MOST_BLOCKS = 2**16  # blocks of which the middles may lie in C
 MOST_CELLS, LEAST_CELLS = 4096, 256  # of C that are looked at
-MOST_PAIRS = 64  # of a cell, evenly chosen
+MOST_PAIRS, LEAST_PAIRS = 64, 4  # of a cell, evenly chosen
 MOST_TARGETS = 2**17  # of all cells that are looked at
 
 
 def ghosts_by_axis(lp: StabilizationLP) -> dict[str, float] | None:
     """Return how many cells of others ranks would know, for each of C, by axis of cuts; collective.
 
-    None where there is nothing to choose: one rank, one axis, no cell, a finite model or recorded
-    data.
+    Of more than ``MOST_SLABS`` ranks, what so many would. None where there is nothing to choose:
+    one rank, one axis, no cell, a finite model or recorded data.
     """
     mesh = lp.mesh
     assert mesh is not None
@@ -26,7 +26,7 @@ def ghosts_by_axis(lp: StabilizationLP) -> dict[str, float] | None:
     several = sum(n > 1 for n in lp.partition.shape) > 1
     if ranks.count == 1 or not several or isinstance(problem.system, MatrixSystem):
         return None
-    return estimated(lp, ranks.count)
+    return estimated(lp, min(ranks.count, cuts.MOST_SLABS))
 
 
 def estimated(lp: StabilizationLP, count: int) -> dict[str, float] | None:
@@ -37,8 +37,9 @@ def estimated(lp: StabilizationLP, count: int) -> dict[str, float] | None:
     every = np.sum(ranks.collect((lp.n, lp.K, len(lp.rows.target))), axis=0).tolist()
     if not every[0]:
         return None
-    blocks = cuts.Blocks.of(lp.partition, _wanted(lp.partition.size, *every))
-    block, own, targets = ranks.agreed(lambda: _own(lp, blocks))
+    most, pairs = _wanted(lp.partition.size, *every)
+    blocks = cuts.Blocks.of(lp.partition, most)
+    block, own, targets = ranks.agreed(lambda: _own(lp, blocks, pairs))
     numbers = np.unique(targets[1])
     cells = read(ranks, mesh.division, numbers, lp.cells.astype(np.float64))
     targets[1] = cells[np.searchsorted(numbers, targets[1])]
@@ -50,15 +51,17 @@ def estimated(lp: StabilizationLP, count: int) -> dict[str, float] | None:
     return ranks.share(ranks.agreed(counted))
 
 
-def _wanted(cells: int, inside: int, pairs: int, entries: int) -> int:
-    """Return how many blocks the box is divided into, so that enough middles lie in C."""
-    targets = entries / max(pairs, 1) * min(pairs / inside, MOST_PAIRS)
+def _wanted(cells: int, inside: int, pairs: int, entries: int) -> tuple[int, int]:
+    """Return how many blocks the box has, so that enough middles lie in C, and pairs of a cell."""
+    each = entries / max(pairs, 1)
+    some = min(max(MOST_TARGETS / LEAST_CELLS / max(each, 1), LEAST_PAIRS), MOST_PAIRS)
+    targets = each * min(pairs / inside, some)
     most = min(max(MOST_TARGETS / max(targets, 1), LEAST_CELLS), MOST_CELLS)
-    return int(min(most * cells / inside, MOST_BLOCKS))
+    return int(min(most * cells / inside, MOST_BLOCKS)), int(some)
 
 
-def _own(lp: StabilizationLP, blocks: cuts.Blocks) -> tuple[Indices, Indices, Indices]:
-    """Return blocks whose middles are own cells of C, these, and what they lead to.
+def _own(lp: StabilizationLP, blocks: cuts.Blocks, most: int) -> tuple[Indices, Indices, Indices]:
+    """Return blocks whose middles are own cells of C, these, and what ``most`` pairs lead to.
 
     The last are whose they are, and global numbers of cells of C, shape (2, t), each once.
     """
@@ -68,7 +71,7 @@ def _own(lp: StabilizationLP, blocks: cuts.Blocks) -> tuple[Indices, Indices, In
     block = np.flatnonzero(np.append(lp.cells, -1)[at] == middles)
     own = at[block]
     first, count = lp.pair_pointer[own], np.diff(lp.pair_pointer)[own]
-    taken = np.minimum(count, MOST_PAIRS)
+    taken = np.minimum(count, most)
     whose, k = _ranged(taken)
     pair = first[whose] + k * (count[whose] - 1) // np.maximum(taken[whose] - 1, 1)
     begin, length = lp.rows.pointer[pair], np.diff(lp.rows.pointer)[pair]
