@@ -32,16 +32,16 @@ def unproved(ranks: Ranks, lp: StabilizationLP, policy: Policy) -> int:
     """
     starts = _starts(ranks, lp)
     planes = lp.cells[[0, -1] if lp.n else []] // (lp.partition.size // lp.partition.shape[0])
-    rest, runs, slack, count = np.arange(lp.n), planes.reshape(-1, 2), 0, 0
+    rest, runs, slack, count = np.ones(lp.n, dtype=np.bool_), planes.reshape(-1, 2), 0, 0
     some = np.unique(np.linspace(0, lp.n - 1, min(lp.n, FIRST)).astype(np.int64))
-    while ranks.any(len(rest) > 0):
+    while ranks.any(bool(rest.any())):
         window = Window.around(lp.partition, runs, slack)
-        told = Telling.agreed(ranks, starts, window.runs if len(rest) else [])
+        told = Telling.agreed(ranks, starts, window.runs if len(some) else [])
         status = told.heard(lp.cell_status)
         found = ranks.agreed(partial(_judged, lp, some, lp.control[policy[some]], window, status))
         count += int((~found.proved & ~found.beyond).sum())
-        rest = np.union1d(np.setdiff1d(rest, some, assume_unique=True), some[found.beyond])
-        some = rest
+        rest[some] = found.beyond
+        some = np.flatnonzero(rest)
         runs = joined(*np.append(runs, found.left, axis=0).T)
         slack = window.planes // SLACK
     return sum(ranks.collect(count))
