@@ -81,8 +81,7 @@ def _command(parsed: Arguments) -> Callable[[Ranks, Arguments], int]:
 
 
 def _by_first(ranks: Ranks, parsed: Arguments) -> int:
-    status = ranks.agreed(lambda: int(parsed.run(parsed)) if ranks.rank == 0 else 0)
-    return ranks.share(status)
+    return ranks.by_first(lambda: int(parsed.run(parsed)))
 
 
 def _refuse(ranks: Ranks, parsed: Arguments) -> int:

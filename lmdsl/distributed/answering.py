@@ -96,7 +96,7 @@ def _answered(
     """Answer a compiled problem; ``folder`` is that of a checkpoint to begin with."""
     ranks, deadline = maker.ranks, maker.deadline
     maker.of_model(lp)
-    refused = maker.by_first(
+    refused = maker.ranks.by_first(
         lambda: ruled_out(
             lp.problem, lp.partition, maker.extent, wanted.require_all, deadline.again()
         )

@@ -5,7 +5,6 @@ attractor cells, what follows from recorded data, and the bracket of gamma_bar w
 small; of a larger one all ranks prove it.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,7 +18,7 @@ from lmdsl.model.grid.boxes import Area
 from lmdsl.model.lp import StabilizationLP
 from lmdsl.model.stabilizable_set import CellStatus
 from lmdsl.optimize.feasibility import gamma_bar
-from lmdsl.ranks.verbs import Item, Ranks
+from lmdsl.ranks.verbs import Ranks
 from lmdsl.results.directory import audit
 from lmdsl.results.directory.archive import Stored
 from lmdsl.results.directory.recorded import data_differences, policy_of
@@ -31,12 +30,6 @@ from lmdsl.slabs.gamma import bracket, whole
 from lmdsl.systems import DataSystem
 
 VECTORS = ("control_index", "value", "lower", "measure", "cell_status", "witness", "sure_levels")
-
-
-def by_first(ranks: Ranks, work: Callable[[], Item]) -> Item:
-    """Return what rank 0 makes, on every rank; its error is raised on all. Collective."""
-    found = ranks.agreed(lambda: work() if ranks.rank == 0 else None)
-    return ranks.share(found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,10 +99,10 @@ def differences(
     if not ranks.all(same_levels(compiled, own)):
         reasons.append(audit.OTHER_LEVELS)
     mass, beyond = sum(ranks.collect(audit.mass(here, own))), _beyond(model)
-    reasons += by_first(ranks, lambda: audit.facts(own, stored.certificate, found, mass, beyond))
+    reasons += ranks.by_first(lambda: audit.facts(own, stored.certificate, found, mass, beyond))
     every = whole.model(lp) if isinstance(lp.problem.system, DataSystem) else lp
-    reasons += by_first(
-        ranks, lambda: [] if every is None else data_differences(every, stored.result)
+    reasons += ranks.by_first(
+        lambda: [] if every is None else data_differences(every, stored.result)
     )
     bracketed = partial(_enclosed, model, compiled, found, deadline)
     return [*reasons, *audit.bracket(own, found, compiled.gamma, bracketed)]
@@ -133,7 +126,7 @@ def local_differences(model: OwnPart, deadline: Deadline) -> list[str]:
     every = replace(lp, cell_status=lp.cell_status if status is None else status,
                     hold=hold, sure_levels=None, mesh=None)  # fmt: skip
     result, certificate = model.stored.result, model.stored.certificate
-    return by_first(ranks, lambda: audit.local_differences(every, result, certificate, deadline))
+    return ranks.by_first(lambda: audit.local_differences(every, result, certificate, deadline))
 
 
 def _counted(model: OwnPart) -> dict[str, float]:
@@ -166,8 +159,8 @@ def _enclosed(
     ranks = model.ranks
     if whole.fits(compiled, whole.MOST_WHOLE):
         every = whole.model(compiled)
-        return by_first(
-            ranks, lambda: (0.0, 0.0) if every is None else gamma_bar.enclosed(every, low, high)
+        return ranks.by_first(
+            lambda: (0.0, 0.0) if every is None else gamma_bar.enclosed(every, low, high)
         )
     refused = found.refusal and model.lp is compiled
     w = model.own.refusal_vector[model.cells] if refused else None

@@ -2,7 +2,6 @@
 
 import contextlib
 import math
-from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
 from typing import Any
@@ -28,7 +27,7 @@ from lmdsl.model.sets import attractor_note
 from lmdsl.model.stabilizable_set import CellStatus, sets_of
 from lmdsl.optimize.feasibility.restriction import refusal_of_cells
 from lmdsl.problem.problem import Problem
-from lmdsl.ranks.verbs import Alone, Item, RankError, Ranks
+from lmdsl.ranks.verbs import Alone, RankError, Ranks
 from lmdsl.results.job import Extent, left_out, success, together
 from lmdsl.results.result import Result
 from lmdsl.results.status import Cause, Status
@@ -65,12 +64,6 @@ class AnswerMaker:
         self.lp: StabilizationLP
         self.extent: Extent
         self.starts: Indices
-
-    def by_first(self, work: Callable[[], Item]) -> Item:
-        """Return what rank 0 makes, on every rank; its error is raised on all. Collective."""
-        first = self.ranks.rank == 0
-        found = self.ranks.agreed(lambda: work() if first else None)
-        return self.ranks.share(found)
 
     def of_model(self, lp: StabilizationLP) -> None:
         """Count the cells of a model; collective."""
@@ -155,7 +148,7 @@ class AnswerMaker:
     def _area(self, chosen: Bools) -> Area | None:
         """Return own cells of C and those of other ranks by region; None for none; collective."""
         cells = self.ranks.gathered(self.lp.cells[chosen])
-        return self.by_first(
+        return self.ranks.by_first(
             lambda: None if cells is None or not len(cells) else Area.of(self.lp.partition, cells)
         )
 
@@ -279,7 +272,7 @@ class AnswerMaker:
                      data.sentence() if data else "", error.warning() if error else ""]  # fmt: skip
             return local, error, data, notes
 
-        beside: _Beside = self.by_first(found)
+        beside: _Beside = self.ranks.by_first(found)
         return beside
 
     def _data(self, witness: Witness, finish: Deadline) -> DataReport | None:

@@ -188,7 +188,7 @@ class DividedSteps:
                 return None
             return self.whole.move(mine, self.guard, absorb, pieces)
 
-        every = [part for part in self.ranks.collect(self.ranks.agreed(moved)) if part is not None]
+        every = [part for part in self.ranks.told(moved) if part is not None]
         lengths = [len(part.cell) for part in every]
         parts: list[Any] = [
             np.broadcast_to(part.part, n) for part, n in zip(every, lengths, strict=True)

@@ -17,7 +17,7 @@ from lmdsl.common import inputs
 from lmdsl.common.on_disk import Disk
 from lmdsl.common.types import FilePath, Guard, Progress, told
 from lmdsl.distributed import auditing, loading
-from lmdsl.distributed.auditing import OwnPart, by_first
+from lmdsl.distributed.auditing import OwnPart
 from lmdsl.machine.deadline import Deadline
 from lmdsl.machine.surroundings import own_arithmetic
 from lmdsl.model.stabilizable_set import LOST, CellStatus
@@ -80,9 +80,7 @@ def verify(
         if stored is not None:
             ranks.alike(stored.certificate.model_dump_json(), "certificates")
         if stored is None or _needs_all(stored):
-            return by_first(
-                ranks,
-                lambda: verify_alone(
+            return ranks.by_first(lambda: verify_alone(
                     path, exact=exactly, progress=heard, time_limit=deadline,
                     rows_on_disk=rows_on_disk,
                 ),
@@ -123,7 +121,7 @@ def _verified(
     reasons += auditing.differences(model, whole, certificate, deadline)
     ranks.agreed(in_time)
     reasons += auditing.local_differences(model, deadline)
-    wrong, noted = by_first(ranks, lambda: _of_proof(path, stored, in_time))
+    wrong, noted = ranks.by_first(lambda: _of_proof(path, stored, in_time))
     reasons += wrong
     notes += noted
     said = tuple(reasons), tuple(notes)

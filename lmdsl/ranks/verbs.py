@@ -158,22 +158,39 @@ class Ranks(ABC):
         another. Long work asks a :class:`~lmdsl.ranks.watching.Watched` deadline, which ends it
         once another rank has failed.
         """
+        outcome, error = self._tried(work)
+        self._end(self.collect(error))
+        return outcome
+
+    def told(self, work: Callable[[], Item]) -> list[Item]:
+        """Return what ``work()`` returns on every rank, in order, on all; as :meth:`agreed`."""
+        every = self.collect(self._tried(work))
+        self._end([error for _, error in every])
+        return [outcome for outcome, _ in every]
+
+    def by_first(self, work: Callable[[], Item]) -> Item:
+        """Return what ``work()`` returns on rank 0, which alone does it, on every rank; as told."""
+        found: Any = self.told(lambda: None if self.rank else work())[0]
+        return found  # type: ignore[no-any-return]
+
+    def _tried(self, work: Callable[[], Item]) -> tuple[Item, Exception | None]:
+        """Return what work returns, or the error that it raises, of which others are warned."""
         outcome: Any = None
-        error: Exception | None = None
         try:
-            outcome = work()
-        except Exception as raised:
-            error = raised
+            return work(), None
+        except Exception as error:
             if not isinstance(error, Elsewhere):
                 self._warn()
-        every = self.collect(error)
+            return outcome, error
+
+    def _end(self, every: list[Exception | None]) -> None:
+        """Raise the error that is to be raised on all ranks, if any."""
         failed = [k for k, e in enumerate(every) if e is not None and not isinstance(e, Elsewhere)]
         self._calm(failed)
         first = next((every[k] for k in failed), None)
         if first is not None:
             vars(first)["agreed"] = True  # see :func:`lmdsl.ranks.ending.together`
             raise first
-        return outcome  # type: ignore[no-any-return]
 
     def alike(self, item: Any, what: str) -> None:
         """Refuse ranks that do not all have the same item: files, versions, sizes."""

@@ -77,8 +77,12 @@ def _settled(ranks: Ranks, problem: Problem, deadline: Deadline) -> Problem:
     system: Any = problem.system
     if getattr(system, "substeps", None) != "auto":
         return problem
-    found: Any = ranks.agreed(lambda: None if ranks.rank else settled(problem, deadline))
-    count = ranks.share(None if found is None else int(found.system.substeps))
+
+    def settle() -> int:
+        found: Any = settled(problem, deadline)
+        return int(found.system.substeps)
+
+    count = ranks.by_first(settle)
     return problem.replaced(system=system.replaced(substeps=count))
 
 

@@ -48,7 +48,7 @@ def estimated(lp: StabilizationLP, count: int) -> dict[str, float] | None:
     def counted() -> dict[str, float] | None:
         return None if parts is None else cuts.ghosts(blocks, _joined(parts), count)
 
-    return ranks.share(ranks.agreed(counted))
+    return ranks.told(counted)[0]
 
 
 def _wanted(cells: int, inside: int, pairs: int, entries: int) -> tuple[int, int]:

@@ -176,9 +176,8 @@ def divided(
         return Division.cut(np.ones(1, dtype=np.int64), count, np.array([F]))
     some = np.unique(np.linspace(0, F - 1, min(F, LOOKED_AT)).astype(np.int64))
     own = some[len(some) * ranks.rank // count : len(some) * (ranks.rank + 1) // count]
-    found = np.concatenate(
-        ranks.collect(ranks.agreed(lambda: _counted(problem, partition, sets, own, deadline)))
-    )
+    every = ranks.told(lambda: _counted(problem, partition, sets, own, deadline))
+    found = np.concatenate(every)
     ends = np.concatenate([(some[1:] + some[:-1]) // 2 + 1, [F]])  # of the cells around each
     return Division.cut(found, count, np.diff(ends, prepend=0))
 

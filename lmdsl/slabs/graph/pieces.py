@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.machine.deadline import Deadline
+from lmdsl.machine.forking import cached_property
 from lmdsl.machine.kernels import kernel
-from lmdsl.model.grid.declared_sets import DeclaredSet
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import (
     PART,
@@ -53,15 +53,14 @@ class BoxPieces:
         How many cells before each piece are free, then of all, shape (pieces + 1,).
     known
         Which pieces are known.
-    mass
-        The weight of cells.
     """
 
-    def __init__(
-        self, partition: Partition, attractor: DeclaredSet, avoid: DeclaredSet, mass: Mass
-    ) -> None:
-        self.partition, self.mass = partition, mass
-        self._attractor, self._avoid = attractor, avoid
+    def __init__(self, problem: Problem, partition: Partition, guard: Guard) -> None:
+        self.problem, self.partition, self._guard = problem, partition, guard
+        self._attractor = attractor_of(problem, partition, guard)
+        if self._attractor.empty and not problem.attractor.empty:
+            raise no_cell(problem.attractor, partition, "attractor")
+        self._avoid = avoid_of(problem, partition, guard)
         count = -(-partition.size // PIECE)
         self.number = untouched(partition.size, np.int32)
         self.known = np.zeros(count, dtype=np.bool_)
@@ -74,19 +73,19 @@ class BoxPieces:
 
         Raises what :meth:`CellSets.of` does, on every rank: each looks at its share of the box.
         """
-        attractor = ranks.agreed(lambda: attractor_of(problem, partition, guard))
-        if attractor.empty and not problem.attractor.empty:
-            ranks.agreed(lambda: _refuse(no_cell(problem.attractor, partition, "attractor")))
-        avoid = ranks.agreed(lambda: avoid_of(problem, partition, guard))
-        mass = ranks.agreed(lambda: Mass(problem, partition, guard))
-        made = cls(partition, attractor, avoid, mass)
+        made = ranks.agreed(lambda: cls(problem, partition, guard))
         count, r = len(made.known), ranks.rank
         share = range(count * r // ranks.count, count * (r + 1) // ranks.count)
-        free = np.concatenate(ranks.collect(ranks.agreed(lambda: made._count(share))))
-        if not ranks.any(ranks.agreed(lambda: made._weighed(share))):
+        free = np.concatenate(ranks.told(lambda: made._count(share)))
+        if not any(ranks.told(lambda: made._weighed(share))):
             ranks.agreed(lambda: _refuse(weightless()))
         made.before = np.append(0, np.cumsum(free)).astype(np.int64)
         return made
+
+    @cached_property
+    def mass(self) -> Mass:
+        """The weight of cells."""
+        return Mass(self.problem, self.partition, self._guard)
 
     @property
     def free(self) -> int:
@@ -157,10 +156,10 @@ class BoxPieces:
 
     def _weighed(self, share: range) -> bool:
         """Return whether a cell of a share carries weight; BadInput: a density is wrong there."""
-        found = self.mass.problem.measure is None
+        found, mass = self.problem.measure is None, self.mass
         last = min(share.stop * PIECE, self.partition.size)
         for start in range(share.start * PIECE, last if not found else 0, PART):
-            found |= bool(self.mass.on(np.arange(start, min(start + PART, last))).any())
+            found |= bool(mass.on(np.arange(start, min(start + PART, last))).any())
         return found
 
 
