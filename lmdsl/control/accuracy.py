@@ -167,5 +167,5 @@ def _missed(pairs: JudgedPairs, rates: Quadrature) -> float | None:
 def statuses(sets: CellSets) -> Statuses:
     """Return what every cell is before anything is compiled, shape (N,)."""
     status = np.full(len(sets.number), CellStatus.STABILIZED, dtype=np.uint8)
-    status[sets.attractor], status[sets.avoid] = CellStatus.ATTRACTOR, CellStatus.AVOID
+    status[sets.attractor[:]], status[sets.avoid[:]] = CellStatus.ATTRACTOR, CellStatus.AVOID
     return status

@@ -35,6 +35,7 @@ from lmdsl.results.summary import Seconds, Summary
 from lmdsl.slabs import digest
 from lmdsl.slabs.gamma import whole
 from lmdsl.slabs.gamma.restricting import restricted
+from lmdsl.slabs.graph.pieces import PieceSets
 from lmdsl.slabs.solving import Solved
 from lmdsl.systems import DataSystem
 
@@ -251,20 +252,23 @@ class AnswerMaker:
     def _beside(self, witness: Witness) -> "_Beside":
         """Return what rank 0 finds out beside the proof, and the sentences about it.
 
-        Of a map without a local controller that needs nothing of all cells.
+        Of a local controller that needs the statuses of all cells.
         """
         lp, finish = self.lp, self.deadline.again()
         equation = lp.problem.flow(cost=False) is not None
-        needed = equation or lp.problem.local_controller is not None
-        status = self.ranks.gathered(lp.cell_status) if needed else None
+        controlled = lp.problem.local_controller is not None
+        status = self.ranks.gathered(lp.cell_status) if controlled else None
         hold = None if lp.hold is None else self.ranks.gathered(lp.hold)
         data = self._data(witness, finish)
 
         def found() -> Any:
             error, local = None, None
-            if status is not None and equation:
+            if equation:
                 with contextlib.suppress(TimeLimitReached):
-                    error = integration_error(lp.problem, sets_of(status), finish)
+                    holds = None if lp.hold is None else status
+                    alone = partial(PieceSets.alone, lp.problem, finish)
+                    sets = alone() if holds is None else sets_of(holds)
+                    error = integration_error(lp.problem, sets, finish)
             if status is not None:
                 local = check_of(replace(lp, cell_status=status, hold=hold, mesh=None), finish)
             held = holding.note(lp.problem, lp.partition, hold)

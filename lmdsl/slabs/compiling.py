@@ -15,6 +15,7 @@ from lmdsl.common.on_disk import Disk, beside, taken
 from lmdsl.common.types import Bools, Floats, Indices, Statuses
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.algorithm_1 import owner
+from lmdsl.model.assembly.estimates import unless_short
 from lmdsl.model.assembly.substeps import settled
 from lmdsl.model.discretization import control_vectors
 from lmdsl.model.grid.partition import Partition
@@ -27,6 +28,7 @@ from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.verbs import Ranks
 from lmdsl.slabs.graph import levels
 from lmdsl.slabs.graph.pairs import OwnPairs, assembled
+from lmdsl.slabs.graph.pieces import PieceSets
 
 
 def compiled(
@@ -79,7 +81,8 @@ def _settled(ranks: Ranks, problem: Problem, deadline: Deadline) -> Problem:
         return problem
 
     def settle() -> int:
-        found: Any = settled(problem, deadline)
+        sets = PieceSets.alone(problem, unless_short(problem, deadline))
+        found: Any = settled(problem, deadline, sets)
         return int(found.system.substeps)
 
     count = ranks.by_first(settle)

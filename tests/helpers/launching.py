@@ -20,13 +20,13 @@ def needs_mpi(test):
     return pytest.mark.mpi(pytest.mark.skipif(absent, reason="needs mpi4py and an MPI")(test))
 
 
-def launch(count, program, *arguments, script="rank_programs.py"):
-    """Run a program of a script on so many processes; return how it ended."""
+def launch(count, program, *arguments, script="rank_programs.py", limit=60):
+    """Run a program of a script on so many processes, for seconds at most; return how it ended."""
     script = Path(__file__).with_name(script)
     command = [LAUNCHER, "-n", str(count), sys.executable, str(script), program, *arguments]
     path = os.pathsep.join((str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")))
     env = {**os.environ, "NUMBA_NUM_THREADS": "1", "PYTHONPATH": path}
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, env=env)
+    return subprocess.run(command, capture_output=True, text=True, timeout=limit, env=env)
 
 
 def returned(count, program, *arguments, script="rank_programs.py"):

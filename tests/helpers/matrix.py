@@ -60,7 +60,7 @@ def _print(ranks, name):
 
 def as_processes(count, names):
     """What MPI processes answer, where threads answer something else; nothing if they agree."""
-    done = launch(count, "prints", *names, script="matrix.py")
+    done = launch(count, "prints", *names, script="matrix.py", limit=300 + 60 * len(names))
     if done.returncode:
         return [f"{names}: {done.stderr[-500:]}"]
     found = json.loads(done.stdout.splitlines()[-1])

@@ -29,10 +29,13 @@ LARGEST = 2 ** int(np.log2(MOST))  # automatic substeps
 ATTEMPTS = MOST  # steps of the accurate integrator: where it takes more, so does Runge-Kutta
 
 
-def settled(problem: Problem, deadline: Deadline | None = None) -> Problem:
+def settled(
+    problem: Problem, deadline: Deadline | None = None, sets: CellSets | None = None
+) -> Problem:
     """Return a problem whose substeps are a number: ``auto`` is as many as it takes.
 
-    What compiles in a moment has two seconds at least: fast equations take longer than cells.
+    ``sets`` are its cells, where they are known. What compiles in a moment has two seconds at
+    least: fast equations take longer than cells.
 
     Raises
     ------
@@ -45,7 +48,7 @@ def settled(problem: Problem, deadline: Deadline | None = None) -> Problem:
         return problem
     deadline = Deadline.of(deadline)
     hurried = unless_short(problem, deadline) is deadline
-    pairs, count = JudgedPairs.of(problem, None, deadline if hurried else deadline.again()), 1
+    pairs, count = JudgedPairs.of(problem, sets, deadline if hurried else deadline.again()), 1
     assert pairs is not None
     if pairs.given_up:
         raise BadInput(_too_fast(problem), "system.substeps")

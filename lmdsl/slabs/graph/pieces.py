@@ -26,6 +26,7 @@ from lmdsl.model.sets import (
     PART,
     CellSets,
     Mass,
+    always_whole,
     attractor_of,
     avoid_of,
     no_cell,
@@ -33,7 +34,7 @@ from lmdsl.model.sets import (
     weightless,
 )
 from lmdsl.problem.problem import Problem
-from lmdsl.ranks.verbs import Ranks
+from lmdsl.ranks.verbs import Alone, Ranks
 from lmdsl.slabs.graph.planes import Planes, untouched
 
 PIECE = 2**10  # cells
@@ -207,6 +208,14 @@ class PieceSets(CellSets):
         attractor, avoid, mass, free = (cast(Any, view) for view in views)
         planes = Planes(partition, pieces.number, F, pieces.meet_range)
         return cls(attractor, avoid, mass, free, pieces.number, pieces, planes)
+
+    @classmethod
+    def alone(cls, problem: Problem, deadline: Deadline) -> CellSets:
+        """Return the sets of a problem for one rank that looks at a few cells all over the box."""
+        partition = Partition.of(problem)
+        if always_whole(problem):
+            return CellSets.of(problem, partition, deadline)
+        return cls.over(Alone(), problem, partition, deadline)
 
     def meet(self, index: Floats | Indices) -> None:
         """See :meth:`CellSets.meet`."""
