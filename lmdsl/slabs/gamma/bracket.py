@@ -22,6 +22,7 @@ from lmdsl.slabs.chains.first import First
 from lmdsl.slabs.gamma import refusing
 
 WIDTH, PROBES = 1e-3, 12  # relative width aimed at, and number of gammas asked for it
+MISSES = 3  # times that no refusal was found, which takes many passes, before no other is tried
 
 
 def bracket(
@@ -39,15 +40,17 @@ def bracket(
             low = max(low, at)
         if (not gain and low > 1) or low >= enough[0]:
             break
-    high = min(least_high(lp, w), lp.gamma)
+    high, below, missed = min(least_high(lp, w), lp.gamma), low, 0
     for _ in range(PROBES):
-        if high <= max(low * (1 + WIDTH), enough[1]) or low <= 1 or time_up():
+        if high <= max(below * (1 + WIDTH), enough[1]) or low <= 1 or missed > MISSES or time_up():
             break
-        between = math.sqrt(low * high)
-        found = refusing.refusal(replace(lp, gamma=between, _known=lp._algorithm_1), time_up)
+        between = math.sqrt(below * high)
+        asked = replace(lp, gamma=between, _known=lp._algorithm_1)
+        found = refusing.refusal(asked, time_up, refusing.SLACKS[:1])
         if found is None:
-            break
-        high = min(high, least_high(lp, found), between)
+            below, missed = between, missed + 1
+        else:
+            high = min(high, least_high(lp, found), between)
     return low, high
 
 

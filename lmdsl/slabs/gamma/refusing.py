@@ -6,6 +6,8 @@ by less than that factor leaves a proof at gamma. Where w falls to nothing no ce
 and nothing is claimed; nor where passes run out, which they do only close to gamma_bar.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lmdsl.certificate import bounds
@@ -18,14 +20,16 @@ PASSES = 500  # number of passes for each above which none is in sight
 NOTHING = 1e-12  # value below which a cell counts as one that can be left
 
 
-def refusal(lp: StabilizationLP, time_up: TimeUp) -> Floats | None:
+def refusal(
+    lp: StabilizationLP, time_up: TimeUp, slacks: Sequence[float] = SLACKS
+) -> Floats | None:
     """Return w >= 0 of own cells, not 0 everywhere, with w <= gamma P_a w; collective."""
     assert lp.mesh is not None
     ranks = lp.mesh.ranks
     if lp.gamma <= 1:  # then every policy of C that reaches A has finite cost
         return None
     free = np.zeros(lp.K)  # with a cost, if 0, each row has a margin of its own, on any rank
-    for slack in SLACKS:
+    for slack in slacks:
         w, at = np.ones(lp.n), lp.gamma * (1 - slack)
         for _ in range(PASSES):
             lower = np.minimum(w, backup_below(lp, w, at, free))
