@@ -258,6 +258,13 @@ def test_all_planes_that_an_arc_crosses_are_known(data):
         assert not sets.planes._known[40:].any()
 
 
+def test_marks_of_cells_are_not_taken_for_numbers():
+    sets = PieceSets.over(Alone(), drift(), Partition.of(drift()), Deadline())
+    assert sets.attractor[np.array([0, 64 * 64 - 1])].tolist() == [False, True]
+    with pytest.raises(TypeError, match="bool"):
+        sets.attractor[np.zeros(64 * 64, dtype=bool)]
+
+
 def test_density_and_weights_are_read_by_cells():
     problem = declared()
     partition = Partition.of(problem)

@@ -176,7 +176,10 @@ class _Seen:
     def __getitem__(self, at: Any) -> NDArray[Any]:
         if isinstance(at, slice):
             return self.read(np.arange(*at.indices(self.size)))
-        found = self.read(np.atleast_1d(np.asarray(at, dtype=np.int64)))
+        cells = np.atleast_1d(at)
+        if cells.dtype == np.bool_:
+            raise TypeError("cells are chosen by their numbers, not by bool marks of all")
+        found = self.read(cells.astype(np.int64))
         return found if np.ndim(at) else found[0]
 
 
