@@ -2,8 +2,6 @@
 
 import itertools
 import math
-import threading
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,8 +14,6 @@ from lmdsl.errors import BadInput, shown
 from lmdsl.problem.unions import kinds
 
 MOST_AXES = 8  # with corners: 256 of them
-
-_filtering = threading.Lock()  # filters of warnings are the process's, not a thread's
 
 PerAxis = Annotated[
     Annotated[Count, Tag("<one>")]
@@ -135,12 +131,11 @@ class Sobol(_Points):
     def _points(self, states: Sequence[str]) -> Floats:
         from scipy.stats import qmc
 
-        with _filtering, warnings.catch_warnings():
-            # Balance wants a power of two; any number of points is a valid sample.
-            warnings.simplefilter("ignore", UserWarning)
-            drawn = qmc.Sobol(len(states), scramble=True, seed=self.seed)
-            points: Floats = drawn.random(self.points)
-        return points
+        # Of another number than a power of two SciPy warns: their balance is lost. Filters of
+        # warnings are the process's, not a thread's: the next power is drawn, its first are taken.
+        drawn = qmc.Sobol(len(states), scramble=True, seed=self.seed)
+        points: Floats = drawn.random_base2((self.points - 1).bit_length())
+        return points[: self.points]
 
 
 if TYPE_CHECKING:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 
 import numpy as np
 import pytest
@@ -124,3 +125,17 @@ def test_corners_are_for_eight_axes():
     data["attractor"] = {"cells": [[0] * 8]}
     found = offsets(made(data))[1:]
     assert [tuple(map(int, row)) for row in found] == list(itertools.product((0, 1), repeat=8))
+
+
+@pytest.mark.parametrize("points", [1, 2, 3, 5, 8, 13, 1000])
+def test_sobol_points_are_those_of_scipy(points, monkeypatch):
+    """Whose warning no filter of the process has to hide: these are not a thread's."""
+    from scipy.stats import qmc
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        expected = qmc.Sobol(2, scramble=True, seed=4).random(points)
+    problem = made(turning({"kind": "sobol", "points": points, "seed": 4}))
+    monkeypatch.delattr(warnings, "catch_warnings")
+    warnings.simplefilter("error")
+    np.testing.assert_array_equal(offsets(problem), expected)

@@ -1,7 +1,5 @@
 """x = b + M x class by class, each communicating class after those it leads to."""
 
-import threading
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -14,9 +12,6 @@ from lmdsl.optimize.linear.gauss_seidel import CEILING
 
 MAX_FACTORED = 100_000  # number of cells above which a class is not factored
 DENSE = 50  # number of cells above which a class is factored as a sparse matrix
-
-# Filters of warnings belong to the process: one thread at a time changes and restores them.
-_filtering = threading.Lock()
 
 
 def solve_by_class(M: Any, b: Floats, time_up: TimeUp = never) -> tuple[Floats | None, bool]:
@@ -72,7 +67,7 @@ def _solve_class(M: Any, b: Floats, x: Floats, cells: Indices) -> bool:
         solver = _dense(inner) if len(cells) <= DENSE else _factors(inner)
         y = solver(known)
         y += solver(known - (y - inner @ y))
-    except (RuntimeError, Warning, MemoryError, np.linalg.LinAlgError):
+    except (RuntimeError, MemoryError, np.linalg.LinAlgError):
         return False
     # An irreducible class has a nonnegative solution only if its spectral radius is below 1.
     if not np.isfinite(y).all() or y.min() < 0 or y.max() > CEILING / scale:
@@ -88,11 +83,8 @@ def _factors(inner: Any) -> Callable[[Floats], Floats]:
     from scipy.sparse import eye_array
     from scipy.sparse.linalg import splu
 
-    with _filtering, warnings.catch_warnings():
-        warnings.simplefilter("error")
-        solver: Callable[[Floats], Floats] = splu(
-            (eye_array(inner.shape[0], format="csr") - inner).tocsc()
-        ).solve
+    system = (eye_array(inner.shape[0], format="csr") - inner).tocsc()
+    solver: Callable[[Floats], Floats] = splu(system).solve
     return solver
 
 
