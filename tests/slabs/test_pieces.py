@@ -25,7 +25,7 @@ from lmdsl.slabs import compiling
 from lmdsl.slabs.digest import of_model
 from lmdsl.slabs.graph import pieces
 from lmdsl.slabs.graph.pairs import assembled
-from lmdsl.slabs.graph.pieces import PieceSets, touch
+from lmdsl.slabs.graph.pieces import PieceSets, first_unknown, touch
 from lmdsl.slabs.graph.planes import untouched
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -34,7 +34,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Pieces of few cells, few of them made at a time."""
-    monkeypatch.setattr(pieces, "PIECE", 7)
+    monkeypatch.setattr(pieces, "PIECE", 8)
     monkeypatch.setattr(pieces, "AT_ONCE", 3)
     monkeypatch.setattr(pieces, "PART", 8)
 
@@ -105,6 +105,21 @@ def test_free_cells_are_found_by_their_positions(small_pieces):
         assert sets.free_before(cell) == np.searchsorted(free, cell)
 
 
+@pytest.mark.parametrize("piece", [1, 4, 2**10])
+def test_runs_of_free_cells_are_found_too(monkeypatch, piece):
+    monkeypatch.setattr(pieces, "PIECE", piece)
+    problem = drift()
+    expected = CellSets.of(problem, Partition.of(problem)).free
+    rng = np.random.default_rng(piece)
+    for _ in range(20):  # each time anew, so that no piece is known
+        free = PieceSets.over(Alone(), problem, Partition.of(problem), Deadline()).free
+        first, last = sorted(rng.integers(-len(expected), len(expected) + 9, 2).tolist())
+        for at in (slice(first, last), slice(first, last, 3), slice(None), slice(last, first)):
+            np.testing.assert_array_equal(free[at], expected[at])
+        some = np.unique(rng.integers(0, len(expected), 5))
+        np.testing.assert_array_equal(free[some], expected[some])
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -171,10 +186,11 @@ def test_untouched_pieces_take_no_memory():
 
 
 def test_cells_are_met_wherever_they_stand():
-    known, wanted = np.array([True, False, False]), np.zeros(3, dtype=bool)
-    assert not touch(np.array([np.nan, 0.0, 3.0]), 4, known, wanted)
-    assert touch(np.array([np.nan, 11.0]), 4, known, wanted)
-    assert wanted.tolist() == [False, False, True]
+    known, wanted = np.array([True, False, False, False]), np.zeros(4, dtype=bool)
+    assert first_unknown(np.array([np.nan, 0.0, 3.0]), 2, known) == 3
+    assert first_unknown(np.array([np.nan, 0.0, 11.0, 4.0]), 2, known) == 2
+    touch(np.array([np.nan, 0.0, 11.0, 12.0, 8.0]), 2, known, wanted)
+    assert wanted.tolist() == [False, False, True, True]
 
 
 def crossing():
@@ -183,7 +199,7 @@ def crossing():
         state_box={"x": {"low": 0.0, "high": 1.0, "cells": 1024}},
         system={"kind": "ode", "derivative": {"x": "1 + 0*u"}, "step": 0.16, "substeps": 1},
         attractor={"boxes": [{"x": [0.75, 0.78125]}]},
-        avoid={"boxes": [{"x": [321 / 1024, 323 / 1024]}]}, measure=None,
+        avoid={"boxes": [{"x": [513 / 1024, 515 / 1024]}]}, measure=None,  # of the second rank
     )  # fmt: skip
 
 

@@ -37,7 +37,7 @@ from lmdsl.problem.problem import Problem
 from lmdsl.ranks.verbs import Alone, Ranks
 from lmdsl.slabs.graph.planes import Planes, untouched
 
-PIECE = 2**10  # cells
+PIECE = 2**10  # cells, a power of two
 AT_ONCE = 2**8  # pieces that are made at a time
 
 
@@ -95,13 +95,19 @@ class BoxPieces:
 
     def meet(self, cells: NDArray[Any]) -> None:
         """Make known what cells are, given in any order, NaN for none."""
-        wanted = np.zeros(len(self.known), dtype=np.bool_)
-        if touch(np.ascontiguousarray(cells).reshape(-1), PIECE, self.known, wanted):
+        cells = np.ascontiguousarray(cells).reshape(-1)
+        bits = PIECE.bit_length() - 1
+        first = first_unknown(cells, bits, self.known)
+        if first < len(cells):
+            wanted = np.zeros(len(self.known), dtype=np.bool_)
+            touch(cells[first:], bits, self.known, wanted)
             self.make(np.flatnonzero(wanted))
 
     def meet_range(self, first: int, last: int) -> None:
         """Make known what the cells first..last-1 are."""
-        pieces = np.arange(first // PIECE, -(-last // PIECE))
+        self._require(np.arange(first // PIECE, -(-last // PIECE)))
+
+    def _require(self, pieces: Indices) -> None:
         unknown = pieces[~self.known[pieces]]
         if len(unknown):
             self.make(unknown)
@@ -127,13 +133,26 @@ class BoxPieces:
         """Return free cells by their positions among all, ascending ones."""
         piece = np.searchsorted(self.before, positions, side="right") - 1
         pieces, which = np.unique(piece, return_inverse=True)
-        self.make(pieces)
-        cells = self._cells(pieces)
-        numbers = self.number[cells]
-        cells = cells[(numbers >= 0) & (numbers < self.free)]
+        cells = self._free_of(pieces)
         starts = np.append(0, np.cumsum(self.before[pieces + 1] - self.before[pieces]))
         at: Indices = starts[which] + positions - self.before[piece]
         return cells[at]
+
+    def chosen_range(self, first: int, last: int) -> Indices:
+        """Return the free cells at the positions first..last-1 among all."""
+        if first >= last:
+            return np.empty(0, dtype=np.int64)
+        ends = np.searchsorted(self.before, (first, last - 1), side="right").tolist()
+        pieces = np.arange(ends[0] - 1, ends[1])
+        at = first - int(self.before[pieces[0]])
+        return self._free_of(pieces)[at : at + last - first]
+
+    def _free_of(self, pieces: Indices) -> Indices:
+        """Return the free cells of some pieces, ascending ones."""
+        self._require(pieces)
+        cells = self._cells(pieces)
+        number = self.number[cells]
+        return cells[(number >= 0) & (number < self.free)]
 
     def _cells(self, pieces: Indices) -> Indices:
         cells = (pieces[:, None] * PIECE + np.arange(PIECE)).ravel()
@@ -167,15 +186,20 @@ class BoxPieces:
 class _Seen:
     """An array over cells of which pieces are made once they are looked at."""
 
-    def __init__(self, size: int, read: Callable[[Indices], NDArray[Any]]) -> None:
+    def __init__(
+        self, size: int, read: Callable[[Indices], NDArray[Any]],
+        run: Callable[[int, int], NDArray[Any]] | None = None,
+    ) -> None:  # fmt: skip
         self.size, self.read = size, read
+        self.run = run or (lambda first, last: read(np.arange(first, last)))  # of neighbours
 
     def __len__(self) -> int:
         return self.size
 
     def __getitem__(self, at: Any) -> NDArray[Any]:
         if isinstance(at, slice):
-            return self.read(np.arange(*at.indices(self.size)))
+            first, last, step = at.indices(self.size)
+            return self.run(first, last) if step == 1 else self.read(np.arange(first, last, step))
         cells = np.atleast_1d(at)
         if cells.dtype == np.bool_:
             raise TypeError("cells are chosen by their numbers, not by bool marks of all")
@@ -206,7 +230,7 @@ class PieceSets(CellSets):
             _Seen(N, lambda cells: numbers(cells) == F),
             _Seen(N, lambda cells: numbers(cells) < 0),
             _Seen(N, pieces.mass.on),
-            _Seen(F, pieces.chosen),
+            _Seen(F, pieces.chosen, pieces.chosen_range),
         )
         attractor, avoid, mass, free = (cast(Any, view) for view in views)
         planes = Planes(partition, pieces.number, F, pieces.meet_range)
@@ -240,15 +264,22 @@ class PieceSets(CellSets):
 
 
 @kernel
-def touch(cells, size, known, wanted):  # type: ignore[no-untyped-def]
-    """Mark the pieces of so many cells that some cells are in, and that are not known."""
-    found = False
+def first_unknown(cells, bits, known):  # type: ignore[no-untyped-def]
+    """Return the place of the first cell whose piece of 2**bits is not known, or the end."""
+    for k in range(len(cells)):
+        if cells[k] >= 0 and not known[np.int64(cells[k]) >> bits]:  # not NaN
+            return k
+    return len(cells)
+
+
+@kernel
+def touch(cells, bits, known, wanted):  # type: ignore[no-untyped-def]
+    """Mark the pieces that some cells are in, and that are not known."""
     for k in range(len(cells)):
         if cells[k] >= 0:  # not NaN
-            piece = np.int64(cells[k]) // size
+            piece = np.int64(cells[k]) >> bits
             if not known[piece]:
-                wanted[piece] = found = True
-    return found
+                wanted[piece] = True
 
 
 def _refuse(error: Exception) -> None:

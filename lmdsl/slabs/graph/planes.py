@@ -94,11 +94,14 @@ class Planes:
         self.room.reshape(self.shape)[first:last] = room[at : at + last - first]
 
 
+SMALL = 2**26  # bytes; an array of so many is taken as a whole, for its pages may be large
+
+
 def untouched(size: int, kind: Any) -> NDArray[Any]:
     """Return an array, zeros at first, of which only the parts that are written to take memory."""
-    if not hasattr(mmap, "MAP_ANONYMOUS"):
-        return np.zeros(size, dtype=kind)
     length = max(1, size * np.dtype(kind).itemsize)
+    if length <= SMALL or not hasattr(mmap, "MAP_ANONYMOUS"):
+        return np.zeros(size, dtype=kind)
     pages = mmap.mmap(-1, length, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):  # a page of 2 MB would hold half a million numbers
         pages.madvise(mmap.MADV_NOHUGEPAGE)
