@@ -95,6 +95,8 @@ class BoxPieces:
 
     def meet(self, cells: NDArray[Any]) -> None:
         """Make known what cells are, given in any order, NaN for none."""
+        if self.known.all():
+            return
         cells = np.ascontiguousarray(cells).reshape(-1)
         bits = PIECE.bit_length() - 1
         first = first_unknown(cells, bits, self.known)
@@ -133,7 +135,10 @@ class BoxPieces:
         """Return free cells by their positions among all, ascending ones."""
         piece = np.searchsorted(self.before, positions, side="right") - 1
         pieces, which = np.unique(piece, return_inverse=True)
-        cells = self._free_of(pieces)
+        self._require(pieces)
+        cells = self._cells(pieces)
+        number = self.number[cells]
+        cells = cells[(number >= 0) & (number < self.free)]
         starts = np.append(0, np.cumsum(self.before[pieces + 1] - self.before[pieces]))
         at: Indices = starts[which] + positions - self.before[piece]
         return cells[at]
@@ -143,16 +148,12 @@ class BoxPieces:
         if first >= last:
             return np.empty(0, dtype=np.int64)
         ends = np.searchsorted(self.before, (first, last - 1), side="right").tolist()
-        pieces = np.arange(ends[0] - 1, ends[1])
-        at = first - int(self.before[pieces[0]])
-        return self._free_of(pieces)[at : at + last - first]
-
-    def _free_of(self, pieces: Indices) -> Indices:
-        """Return the free cells of some pieces, ascending ones."""
+        pieces, at = np.arange(ends[0] - 1, ends[1]), first - int(self.before[ends[0] - 1])
         self._require(pieces)
-        cells = self._cells(pieces)
-        number = self.number[cells]
-        return cells[(number >= 0) & (number < self.free)]
+        begin = int(pieces[0]) * PIECE
+        number = self.number[begin : (int(pieces[-1]) + 1) * PIECE]
+        cells = np.flatnonzero((number >= 0) & (number < self.free))
+        return cells[at : at + last - first] + begin
 
     def _cells(self, pieces: Indices) -> Indices:
         cells = (pieces[:, None] * PIECE + np.arange(PIECE)).ravel()
