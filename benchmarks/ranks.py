@@ -3,6 +3,9 @@
 Every row is the standard map, solved in fresh processes with one thread each: by the code of one
 process, and over ranks under MPI, by turns. Of several runs the least counts, as others on the
 machine only add; of several ranks the one that takes most, or, of processor time, their sum.
+
+What processors that share caches and memory take from each other is not the library's: two
+processes that know nothing of each other run side by side, too, and say how much that is.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +30,8 @@ MEMORY, PROCESSOR = 1.15, 1.15  # of an equal share; of one process
 WALL = {"compile": 0.6, "solve": 0.65, "verify": 0.65}
 BYTES = {2: 200, 8: 350}  # an own cell
 CALLS = 700  # of a solve
+BESIDE = -2  # stands for two processes side by side that are no ranks
+NAMES = {0: "one process", BESIDE: "two processes side by side"}
 ONE_THREAD = dict.fromkeys(("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 
 Report = dict[str, Any]  # of one rank
@@ -71,18 +77,26 @@ def agree(run: Run, dozen: bool) -> None:
 
 
 def _of_size(run: Run, cells: int, counts: list[int], mode: str) -> Iterator[dict[str, Any]]:
-    found: dict[int, list[list[Report]]] = {0: [], **{count: [] for count in counts}}
+    beside: dict[int, list[list[Report]]] = {BESIDE: []} if 2 in counts else {}
+    found = {0: [], **beside, **{count: [] for count in counts}}
     name = f"standard map, {cells} x {cells}"
     for _ in range(run.rules.repeats):  # by turns, so that noise hits all alike
         for count, reports in found.items():
-            run.log(f"{name}: {f'{count} ranks' if count else 'one process'}")
+            run.log(f"{name}: {NAMES.get(count, f'{count} ranks')}")
             try:
                 reports.append(launched(count, cells, mode, run.rules.limit))
             except Failed as error:
-                yield _row(f"{name}, {count or 'no'} ranks", "measured", f"failed: {error}", None)
+                what = NAMES.get(count, f"{count} ranks")
+                yield _row(f"{name}, {what}", "measured", f"failed: {error}", None)
                 return
-    one = found.pop(0)
-    run.over_ranks.append({"cells": cells, "mode": mode, "one": one, "ranks": found})
+    one, two = found.pop(0), found.pop(BESIDE, [])
+    run.over_ranks.append(
+        {"cells": cells, "mode": mode, "one": one, "side by side": two, "ranks": found}
+    )
+    for stage in STAGES if two else ():
+        ratio = _taken(two, stage, "cpu", sum) / 2 / _taken(one, stage, "cpu", sum)
+        yield _row(f"{name}: processor time of {stage}, one of two side by side / one alone",
+                   "what the machine adds", f"{ratio:.3g}", None)  # fmt: skip
     for count, reports in found.items():
         yield from rows(f"{name}, {count} ranks", count, one, reports)
 
@@ -150,20 +164,19 @@ def _missing() -> str:
 
 
 def launched(count: int, cells: int, mode: str, limit: float) -> list[Report]:
-    """Return what every rank reports, of no ranks what one process does.
+    """Return what every rank reports, of no ranks what one process does, or two side by side.
 
     Raises
     ------
     Failed
         With the last line that was written, or the limit.
     """
-    command = [
-        sys.executable,
-        "-m",
-        "benchmarks.over_ranks",
-        str(cells),
-        mode if count else "alone",
-    ]
+    if count == BESIDE:
+        with ThreadPoolExecutor(2) as pool:
+            both = pool.map(lambda _: launched(0, cells, mode, limit), range(2))
+            return [report for reports in both for report in reports]
+    mode = mode if count else "alone"
+    command = [sys.executable, "-m", "benchmarks.over_ranks", str(cells), mode]
     launcher = _launcher()
     if count and launcher:
         command = [launcher, "-n", str(count), *command]

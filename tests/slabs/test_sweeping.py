@@ -162,7 +162,8 @@ def test_where_there_is_no_solution_none_is_found(count):
 
 def test_cells_of_which_nobody_can_tell_are_refused():
     halo = peeling.Halo(Alone(), 1, {1: np.array([4, 7])}, {1: np.array([9, 12])})
-    assert peeling._news(halo, np.array([12], dtype=np.uint32))[1].tolist() == [1]
+    lost, place = np.array([12], dtype=np.uint32), peeling._places(halo, 20)
+    assert peeling._news(halo, lost, place)[1].tolist() == [1]
     ways = np.ones(20, dtype=np.uint32)
     assert peeling._freed(halo, {1: np.array([1], dtype=np.uint32)}, ways).tolist() == [7]
     with pytest.raises(RankError, match="rank 1 tells of cells that rank 0 has not"):

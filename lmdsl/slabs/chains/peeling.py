@@ -153,13 +153,14 @@ def _rounds(mesh: Mesh, system: SplitMatrix) -> tuple[CellNumbers, list[int], li
         ways[cells] += np.uint32(1)  # one more for each rank whose cells lead to it
     order, lost = np.empty(columns + int(BYTE), dtype=np.uint32), np.empty(columns - own, np.uint32)
     marks = np.zeros(columns // int(WORD) + 1, dtype=np.uint64)
+    place = _places(halo, columns)
     free = np.flatnonzero(ways[:own] == 0)
     order[: len(free)], end, start = free, len(free), 0
     ends: list[int] = []
     while True:
         end, gone = _cascade(order, start, end, system.kernel, ways, marks, lost)
         ends.append(int(end))
-        came, more = mesh.ranks.exchange_news(_news(halo, np.sort(lost[:gone])))
+        came, more = mesh.ranks.exchange_news(_news(halo, np.sort(lost[:gone]), place))
         if not more:
             break
         start = int(end)
@@ -173,13 +174,22 @@ def _rounds(mesh: Mesh, system: SplitMatrix) -> tuple[CellNumbers, list[int], li
     return order[: ends[-1]].copy(), ends, halo.parted(of, len(ends))
 
 
-def _news(halo: Halo, lost: CellNumbers) -> dict[int, CellNumbers]:
+def _places(halo: Halo, columns: int) -> CellNumbers:
+    """Return the place in its message of each ghost in the plan, by local numbers of all cells."""
+    place = np.zeros(columns, dtype=np.uint32)
+    for slots in halo.slots.values():
+        place[slots] = np.arange(len(slots))
+    return place
+
+
+def _news(halo: Halo, lost: CellNumbers, place: CellNumbers) -> dict[int, CellNumbers]:
     """Return which ghosts their owners are told of, by their places in the plan."""
     parcels = {}
     for of, slots in halo.slots.items():
-        first, last = np.searchsorted(lost, [slots[0], slots[-1] + 1])
+        ends = np.array([slots[0], slots[-1] + 1], dtype=lost.dtype)  # of one kind: no copy of all
+        first, last = np.searchsorted(lost, ends)
         if first < last:
-            parcels[of] = np.searchsorted(slots, lost[first:last]).astype(np.uint32)
+            parcels[of] = place[lost[first:last]]
     return parcels
 
 
@@ -191,8 +201,9 @@ def _freed(halo: Halo, came: dict[int, NDArray[Any]], ways: NDArray[np.uint32]) 
         if len(places) and not places.max() < len(known):
             raise RankError(f"rank {other} tells of cells that rank {halo.ranks.rank} has not")
         cells = known[places]
-        ways[cells] -= np.uint32(1)
-        free.append(cells[ways[cells] == 0])
+        left = ways[cells] - np.uint32(1)
+        ways[cells] = left
+        free.append(cells[left == 0])
     return free[0] if len(free) == 1 else np.sort(np.concatenate([*free, np.empty(0, np.int64)]))
 
 
