@@ -21,7 +21,6 @@ from lmdsl.model.grid.conditions import OnAxes
 from lmdsl.model.grid.declared_sets import CellBlock, DeclaredSet
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.grid.room import free_room
-from lmdsl.problem.local_control import HoldControl
 from lmdsl.problem.problem import Problem
 from lmdsl.problem.sets import Attractor, Measure
 from lmdsl.systems import MatrixSystem
@@ -108,8 +107,7 @@ def scaled(mass: Floats) -> Floats:
 
 def always_whole(problem: Problem) -> bool:
     """Return whether whoever compiles a part of a problem needs the sets of all cells."""
-    holds = isinstance(problem.local_controller, HoldControl)
-    return isinstance(problem.system, MatrixSystem) or holds
+    return isinstance(problem.system, MatrixSystem)
 
 
 def require_apart(partition: Partition, both: Indices) -> None:

@@ -67,7 +67,7 @@ def compiled(
         gamma=problem.gamma,
         weight=_weight(ranks, pairs.sets, cells),
         sure_levels=None if pairs.successors is None else pairs.successors.sure_levels(*part),
-        hold=None if pairs.hold is None else pairs.hold[slice(*part)].copy(),
+        hold=None if pairs.hold is None else pairs.hold.on(*part),
         dropped=pairs.dropped,
         mesh=mesh,
         _known=(level, pair if isinstance(kept, slice) else np.searchsorted(kept, pair)),

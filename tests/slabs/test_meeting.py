@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from alike import alike, answers, sampled
+from problems import made
 from slab_programs import in_global_numbers
 
 import lmdsl as lm
@@ -65,6 +66,30 @@ def test_cells_that_hold(name):
     lp = compared(lm.load(EXAMPLES / f"zoo/{name}.json"), (2, 3))
     assert (lp.hold >= 0).any()
     assert (lp.sure_levels > 0).any()
+
+
+@pytest.mark.parametrize("successors", ["sampled", "enclosed"])
+@pytest.mark.parametrize("partial", [False, True])
+@pytest.mark.parametrize("kind", ["map", "circle", "equation"])
+def test_some_cells_of_an_attractor_hold(kind, partial, successors):
+    """Of a square about rest, on a cylinder, and where ways are judged; not all of its cells."""
+    axis = {"low": -1.0, "high": 1.0, "cells": 12}
+    step = {"x": "x + 0.3*y", "y": "0.9*y + 0.3*u"}
+    if kind == "equation":
+        system = {"kind": "ode", "derivative": {"x": "y", "y": "-0.3*y + u"}, "step": 0.3}
+    else:
+        system = {"kind": "map", "next": step}
+    first = {**axis, "periodic": True} if kind == "circle" else axis
+    lp = compared(made({
+        "format": "lmdsl/1", "system": system, "state_box": {"x": first, "y": axis},
+        "attractor": {"boxes": [{"x": [-0.84, 0.84], "y": [-0.84, 0.84]}]},
+        "avoid": {"boxes": [{"x": [0.9, 1.0], "y": [0.0, 0.4]}]},
+        "control_grid": {"u": {"low": -1, "high": 1, "points": 9}},
+        "stage_cost": "x**2 + y**2 + u**2", "sampling": {"kind": "grid", "per_axis": 3},
+        "successors": successors, "local_controller": {"kind": "hold", "partial": partial},
+    }), (2, 3, 5))  # fmt: skip
+    assert 0 < (lp.hold >= 0).sum() < 100
+    assert lp.n
 
 
 def test_where_no_cell_holds():

@@ -289,3 +289,30 @@ def test_density_and_weights_are_read_by_cells():
     cells = np.array([0, 3, 50, 116])
     assert sets.mass[cells].tobytes() == whole[cells].tobytes()
     assert sets.mass[7] == whole[7]
+
+
+@pytest.mark.parametrize("local", [{"kind": "hold"}, {"kind": "hold", "partial": True}])
+def test_of_cells_that_hold_a_rank_knows_the_attractor_alone(monkeypatch, local):
+    """Beside its own: among all sets that it makes on the way, none of the whole box."""
+    monkeypatch.setattr(pieces, "PIECE", 16)
+    monkeypatch.setattr(sampler, "CHUNK", 2**6)
+    made_of = pieces.BoxPieces.of
+    problem = drift(local_controller=local)
+
+    def program(ranks):
+        return assembled(ranks, problem, Partition.of(problem)), ranks.rank
+
+    every = []
+
+    def noted(ranks, *rest):
+        every.append((ranks.rank, made_of(ranks, *rest)))
+        return every[-1][1]
+
+    monkeypatch.setattr(pieces.BoxPieces, "of", noted)
+    for found, rank in as_threads(4, program):
+        known = [each.known.sum() * 16 for whose, each in every if whose == rank]
+        assert len(known) == (3 if "partial" in local else 4)  # declared, inner, way, compiled
+        assert max(known) <= found.mesh.own + 3 * 64
+        index = found.hold.on(0, 64 * 64).reshape(64, 64)
+        assert (index[-1] == 0).all()
+        assert (index[:-1] == -1).all()

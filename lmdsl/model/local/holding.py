@@ -88,17 +88,34 @@ def held(
     """
     if not isinstance(problem.local_controller, HoldControl):
         return None
-    deadline = Deadline.of(deadline)
     nothing = np.zeros(partition.size, dtype=np.bool_)
     inner = CellSets.made(nothing, ~sets.attractor, sets.mass)
     way = CellSets.made(nothing, sets.avoid, sets.mass)
-    transitions = assemble(problem, partition, None, deadline, inner, way)
     index = np.full(partition.size, -1, dtype=np.int32)
-    if len(transitions.control):
-        successors = Successors.asked_for(problem, partition, transitions, deadline, way=way)
-        inside, alive = keeping(transitions.pair_pointer, transitions.rows, successors)
-        index[inner.free[inside]] = _cheapest(transitions, alive)
+    cells, controls = kept(problem, partition, inner, way, Deadline.of(deadline))
+    index[cells] = controls
     return index
+
+
+def kept(
+    problem: Problem, partition: Partition, inner: CellSets, way: CellSets, deadline: Deadline,
+    part: bool = False,
+) -> tuple[Indices, Controls]:  # fmt: skip
+    """Return the cells that hold, ascending, and the control of each.
+
+    Of ``inner`` the free cells are those that may hold, all others are avoided; ``way`` avoids what
+    ways must not meet. ``part`` says that these are known of some cells only.
+    """
+    span = (0, len(inner.free)) if part else None
+    transitions = assemble(problem, partition, None, deadline, inner, way, span)
+    if not len(transitions.control):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int32)
+    cells = inner.free[:]
+    successors = Successors.asked_for(
+        problem, partition, transitions, deadline, way=way, cells=cells, windowed=part
+    )
+    inside, alive = keeping(transitions.pair_pointer, transitions.rows, successors)
+    return cells[inside], _cheapest(transitions, alive)
 
 
 def within(sets: CellSets, problem: Problem, index: Controls | None) -> CellSets:
@@ -144,13 +161,14 @@ def leaves_nothing(problem: Problem, index: Controls | None) -> bool:
 
 def no_pairs(
     problem: Problem, partition: Partition, progress: Progress | None, deadline: Deadline | None,
-    sets: CellSets, disk: Any = None,
+    sets: CellSets, disk: Any = None, cells: int | None = None,
 ) -> Transitions:  # fmt: skip
-    """Return transitions without a pair, which take no room on a disk."""
+    """Return transitions of all free cells, or so many, without a pair: no room on a disk."""
     F, nothing = len(sets.free), np.zeros(0, dtype=np.int32)
+    cells = F if cells is None else cells
     shares = shares_of(problem, sample_points(problem), noise_nodes(problem))
     rows = Rows(np.zeros(1, dtype=np.int64), nothing, nothing.astype(np.uint8), shares, F)
-    return Transitions(sets, np.zeros(F + 1, dtype=np.int64), nothing, rows, np.zeros(0))
+    return Transitions(sets, np.zeros(cells + 1, dtype=np.int64), nothing, rows, np.zeros(0))
 
 
 def note(problem: Problem, partition: Partition, index: Controls | None) -> str:

@@ -140,7 +140,8 @@ class Successors:
         self._deadline.raise_if_over(DOING)
 
     def _spread(self, marked: Bools) -> Bools:
-        """Return marked free cells as cells of the box, shape (N,)."""
+        """Return marked free cells as cells of the window; outside it no range meets them."""
         cells = np.zeros(self.window.size, dtype=np.bool_)
-        cells[self.transitions.sets.free] = marked
+        at = self.window.positions(self.transitions.sets.free[marked.nonzero()[0]])
+        cells[at[at >= 0]] = True
         return cells

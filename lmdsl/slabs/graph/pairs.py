@@ -14,7 +14,6 @@ from lmdsl.common.on_disk import Disk
 from lmdsl.common.types import Bools, Floats, Indices
 from lmdsl.machine.deadline import Deadline
 from lmdsl.model.assembly.estimates import unless_short
-from lmdsl.model.assembly.given import cut
 from lmdsl.model.assembly.sampler import Block, Sampler
 from lmdsl.model.assembly.transitions import Transitions, assemble
 from lmdsl.model.discretization import control_count
@@ -26,11 +25,11 @@ from lmdsl.model.sets import CellSets, always_whole
 from lmdsl.model.successors.left_out.dropping import listed, others
 from lmdsl.model.successors.survival import Successors
 from lmdsl.problem import Problem
-from lmdsl.problem.local_control import HoldControl
 from lmdsl.ranks.mesh import Mesh
 from lmdsl.ranks.ranges import Division
 from lmdsl.ranks.verbs import Ranks
 from lmdsl.ranks.watching import Watched
+from lmdsl.slabs.graph.holding import HeldCells
 from lmdsl.slabs.graph.meeting import OwnSuccessors
 from lmdsl.slabs.graph.pieces import PieceSets
 from lmdsl.systems import MatrixSystem
@@ -57,7 +56,7 @@ class OwnPairs:
     empty
         Whether no attractor cell holds, so that there is no pair and A is empty.
     hold
-        Control of the attractor cells that hold, else -1, shape (N,); None if not asked for.
+        The cells of the attractor that hold; None if not asked for.
     successors
         What own pairs can meet; None where successors are not enclosed.
     dropped, left
@@ -72,7 +71,7 @@ class OwnPairs:
     cost: Floats
     rows: Rows
     empty: bool
-    hold: holding.Controls | None
+    hold: HeldCells | None
     successors: OwnSuccessors | None
     dropped: NDArray[np.int64] | None
     left: Bools | None
@@ -94,7 +93,7 @@ def assembled(
     cells = sets.free[slice(*span)]
     own = ranks.agreed(
         lambda: (
-            cut(holding.no_pairs(problem, partition, None, deadline, sets), span)
+            holding.no_pairs(problem, partition, None, deadline, sets, cells=span[1] - span[0])
             if empty
             else assemble(problem, partition, deadline=deadline, sets=sets, span=span, disk=disk)
         )
@@ -114,10 +113,10 @@ def assembled(
 
 def _sets(
     ranks: Ranks, problem: Problem, partition: Partition, deadline: Deadline
-) -> tuple[CellSets, holding.Controls | None, bool]:
-    """Return the sets that are compiled, the controls of cells that hold, and if none does.
+) -> tuple[CellSets, HeldCells | None, bool]:
+    """Return the sets that are compiled, the cells that hold, and if none does.
 
-    Collective. Where cells hold, or every rank has the whole model anyway, each makes all sets.
+    Collective. Where every rank has the whole model anyway, each makes all sets.
     """
     limit = unless_short(problem, deadline)
     local = problem.local_controller
@@ -128,10 +127,11 @@ def _sets(
     # Refuse a wrong one before the work.
     if local is not None:
         ranks.agreed(lambda: LocalController.of(problem, partition, sets.attractor, limit))
-    if not isinstance(local, HoldControl):
+    hold = HeldCells.of(ranks, problem, partition, sets, limit)
+    if hold is None:
         return sets, None, False
-    hold = ranks.agreed(lambda: holding.held(problem, partition, sets, limit))
-    return holding.within(sets, problem, hold), hold, holding.leaves_nothing(problem, hold)
+    empty = holding.leaves_nothing(problem, hold.control)
+    return hold.within(ranks, problem, partition, sets), hold, empty
 
 
 def _left(

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from lmdsl.common.types import Bools, Floats, Guard, Indices
 from lmdsl.machine.deadline import Deadline
-from lmdsl.machine.forking import cached_property
 from lmdsl.machine.kernels import kernel
 from lmdsl.model.grid.partition import Partition
 from lmdsl.model.sets import (
@@ -40,6 +39,8 @@ from lmdsl.slabs.graph.planes import Planes, untouched
 PIECE = 2**10  # cells, a power of two
 AT_ONCE = 2**8  # pieces that are made at a time
 
+Kinds = Callable[[Indices], tuple[Bools, Bools]]  # see BoxPieces
+
 
 class BoxPieces:
     """What the cells of a box are, piece by piece; several threads may ask at once.
@@ -48,6 +49,8 @@ class BoxPieces:
     ----------
     partition
         The cells.
+    kinds
+        Says which of some cells, ascending ones, are free, and which are in the attractor.
     number
         As of :class:`CellSets`, of cells that are known.
     before
@@ -56,12 +59,8 @@ class BoxPieces:
         Which pieces are known.
     """
 
-    def __init__(self, problem: Problem, partition: Partition, guard: Guard) -> None:
-        self.problem, self.partition, self._guard = problem, partition, guard
-        self._attractor = attractor_of(problem, partition, guard)
-        if self._attractor.empty and not problem.attractor.empty:
-            raise no_cell(problem.attractor, partition, "attractor")
-        self._avoid = avoid_of(problem, partition, guard)
+    def __init__(self, partition: Partition, kinds: Kinds) -> None:
+        self.partition, self.kinds = partition, kinds
         count = -(-partition.size // PIECE)
         self.number = untouched(partition.size, np.int32)
         self.known = np.zeros(count, dtype=np.bool_)
@@ -69,24 +68,13 @@ class BoxPieces:
         self._lock = threading.Lock()
 
     @classmethod
-    def of(cls, ranks: Ranks, problem: Problem, partition: Partition, guard: Guard) -> Self:
-        """Return the pieces of a problem, none known yet; collective.
-
-        Raises what :meth:`CellSets.of` does, on every rank: each looks at its share of the box.
-        """
-        made = ranks.agreed(lambda: cls(problem, partition, guard))
-        count, r = len(made.known), ranks.rank
-        share = range(count * r // ranks.count, count * (r + 1) // ranks.count)
+    def of(cls, ranks: Ranks, partition: Partition, kinds: Kinds) -> Self:
+        """Return the pieces of a box, none known yet; collective: each looks at its share."""
+        made = ranks.agreed(lambda: cls(partition, kinds))
+        share = _share(ranks, len(made.known))
         free = np.concatenate(ranks.told(lambda: made._count(share)))
-        if not any(ranks.told(lambda: made._weighed(share))):
-            ranks.agreed(lambda: _refuse(weightless()))
         made.before = np.append(0, np.cumsum(free)).astype(np.int64)
         return made
-
-    @cached_property
-    def mass(self) -> Mass:
-        """The weight of cells."""
-        return Mass(self.problem, self.partition, self._guard)
 
     @property
     def free(self) -> int:
@@ -121,7 +109,7 @@ class BoxPieces:
             for at in range(0, len(pieces), AT_ONCE):
                 some = pieces[at : at + AT_ONCE]
                 cells = self._cells(some)
-                free, attractor = self._kinds(cells)
+                free, attractor = self.kinds(cells)
                 of_piece = np.repeat(np.arange(len(some)), PIECE)[: len(cells)]
                 within = np.cumsum(free)
                 starts = np.arange(0, len(cells), PIECE)
@@ -159,29 +147,14 @@ class BoxPieces:
         cells = (pieces[:, None] * PIECE + np.arange(PIECE)).ravel()
         return cells[: np.searchsorted(cells, self.partition.size)]
 
-    def _kinds(self, cells: Indices) -> tuple[Bools, Bools]:
-        """Return which cells are free, and which are in the attractor."""
-        index = self.partition.multi_index(cells)
-        attractor, avoid = self._attractor.on(cells, index), self._avoid.on(cells, index)
-        require_apart(self.partition, cells[attractor & avoid])
-        return ~(attractor | avoid), attractor
-
     def _count(self, share: range) -> Indices:
         """Return how many cells of each piece of a share are free."""
         found = [np.zeros(0, dtype=np.int64)]
         for at in range(share.start, share.stop, AT_ONCE):
             some = np.arange(at, min(at + AT_ONCE, share.stop))
-            free, _ = self._kinds(self._cells(some))
+            free, _ = self.kinds(self._cells(some))
             found.append(np.add.reduceat(free, np.arange(0, len(free), PIECE), dtype=np.int64))
         return np.concatenate(found)
-
-    def _weighed(self, share: range) -> bool:
-        """Return whether a cell of a share carries weight; BadInput: a density is wrong there."""
-        found, mass = self.problem.measure is None, self.mass
-        last = min(share.stop * PIECE, self.partition.size)
-        for start in range(share.start * PIECE, last if not found else 0, PART):
-            found |= bool(mass.on(np.arange(start, min(start + PART, last))).any())
-        return found
 
 
 class _Seen:
@@ -218,9 +191,19 @@ class PieceSets(CellSets):
     @classmethod
     def over(cls, ranks: Ranks, problem: Problem, partition: Partition, deadline: Deadline) -> Self:
         """Return the sets of a problem over ranks; collective. Raises as :meth:`CellSets.of`."""
-        pieces = BoxPieces.of(
-            ranks, problem, partition, partial(deadline.raise_if_over, "compiling")
-        )
+        guard = partial(deadline.raise_if_over, "compiling")
+        kinds = ranks.agreed(lambda: _declared(problem, partition, guard))
+        mass = Mass(problem, partition, guard)
+        made = cls.of_kinds(ranks, partition, kinds, cast(Any, _Seen(partition.size, mass.on)))
+        share = _share(ranks, partition.size)
+        if problem.measure is not None and not any(ranks.told(lambda: _weighed(mass, share))):
+            ranks.agreed(lambda: _refuse(weightless()))
+        return made
+
+    @classmethod
+    def of_kinds(cls, ranks: Ranks, partition: Partition, kinds: Kinds, mass: Floats) -> Self:
+        """Return the sets of which some cells are free, some the attractor; collective."""
+        pieces = BoxPieces.of(ranks, partition, kinds)
 
         def numbers(cells: Indices) -> NDArray[np.int32]:
             pieces.meet(cells)
@@ -230,10 +213,9 @@ class PieceSets(CellSets):
         views = (
             _Seen(N, lambda cells: numbers(cells) == F),
             _Seen(N, lambda cells: numbers(cells) < 0),
-            _Seen(N, pieces.mass.on),
             _Seen(F, pieces.chosen, pieces.chosen_range),
         )
-        attractor, avoid, mass, free = (cast(Any, view) for view in views)
+        attractor, avoid, free = (cast(Any, view) for view in views)
         planes = Planes(partition, pieces.number, F, pieces.meet_range)
         return cls(attractor, avoid, mass, free, pieces.number, pieces, planes)
 
@@ -281,6 +263,35 @@ def touch(cells, bits, known, wanted):  # type: ignore[no-untyped-def]
             piece = np.int64(cells[k]) >> bits
             if not known[piece]:
                 wanted[piece] = True
+
+
+def _declared(problem: Problem, partition: Partition, guard: Guard) -> Kinds:
+    """Return what cells are as a problem declares them; BadInput: they cannot be so."""
+    attractor = attractor_of(problem, partition, guard)
+    if attractor.empty and not problem.attractor.empty:
+        raise no_cell(problem.attractor, partition, "attractor")
+    avoid = avoid_of(problem, partition, guard)
+
+    def kinds(cells: Indices) -> tuple[Bools, Bools]:
+        index = partition.multi_index(cells)
+        inside, avoided = attractor.on(cells, index), avoid.on(cells, index)
+        require_apart(partition, cells[inside & avoided])
+        return ~(inside | avoided), inside
+
+    return kinds
+
+
+def _weighed(mass: Mass, share: range) -> bool:
+    """Return whether a cell of a share carries weight; BadInput: a density is wrong there."""
+    found = False
+    for start in range(share.start, share.stop, PART):
+        found |= bool(mass.on(np.arange(start, min(start + PART, share.stop))).any())
+    return found
+
+
+def _share(ranks: Ranks, count: int) -> range:
+    """Return which of so many things a rank looks at for all."""
+    return range(count * ranks.rank // ranks.count, count * (ranks.rank + 1) // ranks.count)
 
 
 def _refuse(error: Exception) -> None:
