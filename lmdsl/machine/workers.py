@@ -1,8 +1,12 @@
 """Processes of our own that call one Python function many times.
 
-They are made as ``multiprocessing`` makes processes: spawned, unless the program chose another way
-(``multiprocessing.set_start_method``). They end with the block that opened them, with the caller,
-and as soon as it is interrupted or its time is up, whatever they are doing then.
+They are spawned, unless the program chose another way (``multiprocessing.set_start_method``).
+They end with the block that opened them, with the caller, and as soon as it is interrupted or its
+time is up, whatever they are doing then.
+
+Where ``fork`` is the default (Linux before Python 3.14) it cannot be told from a choice: any
+library that only asks for the method, or makes a lock, settles on it, as Numba does when it starts
+its threads, which do not survive a fork. What can be sent is spawned there.
 """
 
 import contextlib
@@ -49,9 +53,7 @@ class Workers:
     def __init__(self, function: Callable[[Any], Any], count: int, where: str) -> None:
         self.count, self.where = count, where
         chosen = multiprocessing.get_start_method(allow_none=True)
-        if chosen != "fork":
-            refuse_unless_sent(function, where)
-        context: Any = multiprocessing.get_context(chosen or "spawn")
+        context: Any = multiprocessing.get_context(start_method(function, where))
         self._processes: list[Any] = []
         self._idle: list[Any] = []
         for _ in range(count):
@@ -147,6 +149,29 @@ def _portable(error: Exception) -> Exception:
     return error
 
 
+def start_method(function: Any, where: str) -> str:
+    """Return how processes that call a function are started.
+
+    Raises
+    ------
+    BadInput
+        It must be sent to them, and cannot be.
+    """
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise BadInput(_UNGUARDED, where)
+    chosen = multiprocessing.get_start_method(allow_none=True)
+    default = multiprocessing.get_all_start_methods()[0]
+    if chosen == "fork" != default:
+        return chosen
+    try:
+        refuse_unless_sent(function, where)
+    except BadInput:
+        if chosen != "fork":
+            raise
+        return chosen
+    return chosen if chosen and chosen != "fork" else "spawn"
+
+
 def refuse_unless_sent(function: Any, where: str) -> None:
     """Refuse a function that a new process could not receive, in words of what to do.
 
@@ -157,8 +182,6 @@ def refuse_unless_sent(function: Any, where: str) -> None:
         import.
     """
     forked = "choose multiprocessing.set_start_method('fork') where the system has it, " + ELSE
-    if getattr(multiprocessing.current_process(), "_inheriting", False):
-        raise BadInput(_UNGUARDED, where)
     try:
         sent = pickle.dumps(function)
     except Exception as error:

@@ -1,5 +1,6 @@
 """Functions of one sample, in a module that other processes can import."""
 
+import multiprocessing
 import os
 import threading
 import time
@@ -43,6 +44,12 @@ def ends(x, u):
 def elsewhere(x, u, here):
     """Another answer in another process."""
     return {"x": x - 0.25 * u + 1e-3 * (os.getpid() != int(here))}
+
+
+def unforked(x, u):
+    if type(multiprocessing.current_process()).__name__ == "ForkProcess":
+        raise ArithmeticError("forked")
+    return right(x, u)
 
 
 def sleeps(x, u):

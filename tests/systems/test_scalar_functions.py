@@ -130,28 +130,6 @@ def test_processes_of_their_own_make_the_calls(tmp_path):
     assert not multiprocessing.active_children()
 
 
-def test_forked_processes_need_nothing_that_is_picklable(monkeypatch, mapped):
-    if "fork" not in multiprocessing.get_all_start_methods():
-        pytest.skip("no fork")
-    monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("warnings.warn", lambda *_, **__: None)  # Python 3.12 warns of threads
-        own = problem(lambda x, u: [x - 0.25 * u], processes=2)
-        assert lm.compile(own).digest == lm.compile(made(steps())).digest
-    assert mapped
-
-
-def test_how_processes_are_made_stays_the_choice_of_the_program():
-    before = multiprocessing.get_start_method(allow_none=True)
-    lm.compile(problem(black_boxes.right, processes=1))
-    assert multiprocessing.get_start_method(allow_none=True) == before
-
-
-def test_a_function_that_cannot_be_sent_is_named():
-    with pytest.raises(lm.BadInput, match=r"system.next: .*cannot be sent .*def at the top"):
-        lm.compile(problem(lambda x, u: [x - 0.25 * u], processes=2))
-
-
 def test_an_answer_that_depends_on_the_process_is_named():
     data = steps()
     system = FunctionSystem(
