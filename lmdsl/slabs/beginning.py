@@ -76,7 +76,7 @@ def climbing(
     horizon = 64.0 * max(ranks.collect(int(level.max(initial=0))))
     at, V = 1 - 1 / horizon, np.full(lp.n, horizon)
     for _ in range(ROUNDS):
-        unit = _unit(lp, at)
+        unit = under_unit_cost(lp, at)
         policy, V, _, _ = iterated(First(unit), evaluator(unit, gathered, time_up), policy, V,
                                    time_up)  # fmt: skip
         yield at, policy, V
@@ -85,12 +85,12 @@ def climbing(
         reach, higher = lp.growth, None
         while higher is None and reach > at * (1 + NEAREST):
             reach = at + (reach - at) / 2
-            higher = evaluator(_unit(lp, reach), gathered, time_up).bound(policy, V)
+            higher = evaluator(under_unit_cost(lp, reach), gathered, time_up).bound(policy, V)
         if higher is None:
             return
         at, V = reach, higher
 
 
-def _unit(lp: StabilizationLP, gamma: float) -> StabilizationLP:
+def under_unit_cost(lp: StabilizationLP, gamma: float) -> StabilizationLP:
     """Return the model under unit cost and another gamma."""
     return replace(lp, gamma=gamma, cost=filled(lp.cost, 1.0), _known=lp._algorithm_1)

@@ -42,6 +42,21 @@ def test_the_bracket_of_all_ranks_holds_that_of_one_process(seed, gathered, coun
         assert (other.message, other.gamma_bar) == (found.message, found.gamma_bar)
 
 
+@pytest.mark.parametrize("seed", [7, 24, 33, 45, 48, 56])
+def test_the_bracket_of_all_ranks_is_narrow(seed):
+    """Also where gamma is raised no further, and where cells fall to nothing for ever."""
+    exact = lm.gamma_max(sampled(seed))
+    problem = sampled(seed).replaced(gamma=1.3 * exact.high)
+
+    def program(ranks):
+        lp = compiling.compiled(ranks, problem)
+        return bracket.bracket(lp, refusing.refusal(lp, lambda: False), 0, lambda: False)
+
+    low, high = as_threads(2, program)[0]
+    assert exact.low * (1 - 1.5e-3) < low <= exact.high
+    assert exact.low <= high < exact.high * (1 + 1.5e-3)
+
+
 @pytest.mark.parametrize("whole", [0, 10**7])
 def test_what_a_gamma_leaves_is_solved(whole):
     """By all ranks, and by rank 0: 5 cells, as in one process."""
@@ -126,6 +141,26 @@ def test_a_wrong_plan_proves_no_wrong_bracket():
         for low, high in as_threads(2, program):
             assert low <= exact.high
             assert high >= exact.low
+
+
+def test_no_policy_is_proved_beyond_gamma_bar():
+    """Neither one that passes lead to, nor any other; below it theirs is."""
+    exact = exactly()
+
+    def program(ranks):
+        lp = compiling.compiled(ranks, sampled(18))
+        random = np.random.default_rng(ranks.rank)
+        widths = np.diff(lp.pair_pointer)
+        policies = [bracket.descended(lp, g * exact.low, lambda: False) for g in (0.98, 1.02)]
+        policies += [lp.pair_pointer[:-1] + random.integers(0, widths) for _ in range(3)]
+        return [
+            [bracket.proved_at(lp, policy, g, 0, lambda: False) for policy in policies]
+            for g in (0.98 * exact.low, exact.high * (1 + 1e-6))
+        ]
+
+    below, beyond = as_threads(2, program)[0]
+    assert below[0]
+    assert not any(beyond)
 
 
 def test_a_low_is_proved_of_its_own_policy():

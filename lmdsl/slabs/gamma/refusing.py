@@ -2,8 +2,9 @@
 
 Passes w <- min(w, gamma' min_a P_a w), rounded down, from w = 1 fall to the greatest w <= 1 that
 satisfies w <= gamma' P_a w for every pair; gamma' is just below gamma, so that a pass that lowers w
-by less than that factor leaves a proof at gamma. Where w falls to nothing no cell is beyond gamma
-and nothing is claimed; nor where passes run out, which they do only close to gamma_bar.
+by less than that factor leaves a proof at gamma. Cells that can be left fall for ever: after many
+passes those that still fall are set to 0, and passes go on from there. Where w falls to nothing no
+cell is beyond gamma, or close to it, and nothing is claimed; nor where passes run out.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from lmdsl.model.lp import StabilizationLP
 from lmdsl.optimize.descent import backup_below
 
 SLACKS = (1e-3, 1e-6, 1e-9)  # relative distance of gamma' from gamma, one after the other
-PASSES = 500  # number of passes for each above which none is in sight
+PASSES = 500  # number of passes for each before cells are given up, and as many after it
 NOTHING = 1e-12  # value below which a cell counts as one that can be left
 
 
@@ -31,13 +32,16 @@ def refusal(
     free = np.zeros(lp.K)  # with a cost, if 0, each row has a margin of its own, on any rank
     for slack in slacks:
         w, at = np.ones(lp.n), lp.gamma * (1 - slack)
-        for _ in range(PASSES):
+        for k in range(2 * PASSES):
             lower = np.minimum(w, backup_below(lp, w, at, free))
             lower[lower < NOTHING] = 0.0
-            settled = ranks.all(bool((lower >= w * (1 - slack / 2)).all()))
+            still = lower >= w * (1 - slack / 2)
             w = lower
+            settled = ranks.all(bool(still.all()))
             if settled or time_up() or not ranks.any(bool(w.any())):
                 break
+            if k == PASSES:  # what still falls is taken to fall to nothing
+                w[~still] = 0.0
         if not ranks.any(bool(w.any())):
             continue
         if ranks.all(bounds.holds_for_all(lp, w, lp.gamma, None)):
