@@ -69,6 +69,7 @@ def test_a_large_measure_counts_relative_to_its_size(tmp_path):
         assert ("claim 4 measure: holds" in said) == holds, said
 
 
+@pytest.mark.long
 def test_verdicts_agree_on_random_problems(tmp_path):
     rng = np.random.default_rng(5)
     verified = 0

@@ -159,7 +159,7 @@ def test_what_formulas_yield_is_enclosed(text, x, y, wx, wy, seed):
 
 
 @pytest.mark.long
-@settings(max_examples=2000, deadline=None, derandomize=True)
+@settings(max_examples=1000, deadline=None, derandomize=True)
 @given(texts(), coordinate, coordinate, width, width, st.integers(0, 2**32 - 1))
 def test_what_many_formulas_yield_is_enclosed(text, x, y, wx, wy, seed):
     compared(text, x, y, wx, wy, seed)

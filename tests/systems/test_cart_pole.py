@@ -10,6 +10,11 @@ import lmdsl as lm
 M, m, HALF, G = 1.0, 0.1, 0.5, 9.8
 
 
+def whole(test):
+    """Mark a test of the system as it is published: one process solves it, once."""
+    return pytest.mark.long(pytest.mark.xdist_group("cart_pole")(test))
+
+
 def of_time(step, substeps, **parameters):
     """The problem with another step, which is taken in so many parts."""
     system = {**NAMED["cart_pole"].problem["system"], "step": step, "substeps": substeps}
@@ -70,11 +75,13 @@ def test_upright_and_hanging_are_places_of_rest_and_the_mirror_image_moves_alike
     assert (images(problem, -x, -u) == -images(problem, x, u)).all()
 
 
+@whole
 def test_the_controller_is_odd():
     """(x, theta, v, omega, u) -> all negative is exact, and so are mirrored cells."""
     assert_mirrored(solved("cart_pole"), -1, lambda array: array[::-1, ::-1, ::-1, ::-1])
 
 
+@whole
 @pytest.mark.parametrize("place", [-1.5, 0.1, 1.5])
 def test_the_pole_swings_up_from_hanging(place):
     """Measured by the equation itself, integrated with small steps."""
@@ -84,6 +91,7 @@ def test_the_pole_swings_up_from_hanging(place):
     assert energy(path.states[0]) < 0.49 - 0.9 < energy(path.states[-1])
 
 
+@whole
 def test_the_pole_is_balanced_once_it_is_up():
     """By the regulator in A; a run that leaves A on its way to rest is brought back."""
     held = solved("cart_pole").simulate(300, 1000, seed=2, hold=100).held
@@ -92,6 +100,7 @@ def test_the_pole_is_balanced_once_it_is_up():
     assert held.distance[0] < 1e-6  # the median, in cells from the upright
 
 
+@whole
 def test_the_cart_moves_under_the_falling_pole():
     """Near the middle of the rail, of all cells in which the pole falls slowly to the right."""
     result = solved("cart_pole")

@@ -67,7 +67,7 @@ def enclosed(data, judged):
                           "successors": "enclosed"}))  # fmt: skip
 
 
-@pytest.mark.parametrize("judged", ["endpoint", "path"])
+@pytest.mark.parametrize("judged", ["endpoint", pytest.param("path", marks=pytest.mark.long)])
 def test_a_small_maze(judged):
     data = maze(*SMALL, per_axis=1, corners=False, controls=5)
     result = enclosed(data, judged)

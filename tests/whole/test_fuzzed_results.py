@@ -200,7 +200,7 @@ def try_result(folder, saved, seed):
 
 
 @pytest.mark.long
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(seed=SEEDS)
 def test_spoiled_results(folder, saved, seed):
     try_result(folder, saved, seed)

@@ -127,7 +127,7 @@ def by_scipy(result):
     return truth.runs(result, path, at_rest, starts=1000)
 
 
-@pytest.mark.parametrize("judged", ["endpoint", "path"])
+@pytest.mark.parametrize("judged", ["endpoint", pytest.param("path", marks=pytest.mark.long)])
 def test_one_step_of_runge_kutta_is_told_and_simulated_as_it_is(judged, tmp_path, capsys):
     """Verified, and of the compiled steps 99 % arrive; of the equation four in five: both said."""
     result = lm.solve(van_der_pol(substeps=1, judged=judged))
