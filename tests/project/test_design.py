@@ -112,6 +112,22 @@ def test_a_class_name_stands_for_one_class():
     assert not {name: found for name, found in places.items() if len(found) > 1}
 
 
+# What changes filters of warnings, which are the process's: nothing that threads of ours run.
+FILTERING = {
+    "machine.kernels", "data.tables", "plotting.shown", "plotting.pages.writing", "backends.cvxpy",
+    "testing.probe",
+}  # fmt: skip
+
+
+def test_threads_do_not_change_each_others_filters_of_warnings():
+    """Two that do, each under a lock of its own, lose each other's: what compiles and solves."""
+    changes = re.compile(r"catch_warnings|simplefilter|filterwarnings")
+    found = {
+        name for name, path in house.modules(PACKAGE).items() if changes.search(path.read_text())
+    }
+    assert found == FILTERING
+
+
 def test_the_plan_lists_every_package_with_its_sentence():
     plan = (PACKAGE.parent / "docs/design.md").read_text()
     table = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", plan, re.MULTILINE))

@@ -57,6 +57,23 @@ def test_the_bracket_of_all_ranks_is_narrow(seed):
     assert exact.low <= high < exact.high * (1 + 1.5e-3)
 
 
+@pytest.mark.full
+@pytest.mark.parametrize(("cells", "least"), [(150, 2.32), (250, 2.498)])
+def test_the_bracket_of_finer_grids_is_what_docs_say(cells, least):
+    """docs/distributed.md: gamma_bar is 2.5."""
+    data = MAP.to_dict()
+    for axis in data["state_box"].values():
+        axis["cells"] = cells
+
+    def program(ranks):
+        lp = compiling.compiled(ranks, lm.Problem.model_validate(data))
+        return bracket.bracket(lp, refusing.refusal(lp, lambda: False), 10**4, lambda: False)
+
+    low, high = as_threads(2, program)[0]
+    assert least <= low <= 2.5
+    assert 2.5 <= high <= 2.5 * (1 + 1e-9)
+
+
 @pytest.mark.parametrize("whole", [0, 10**7])
 def test_what_a_gamma_leaves_is_solved(whole):
     """By all ranks, and by rank 0: 5 cells, as in one process."""

@@ -29,7 +29,7 @@ from lmdsl.slabs.gamma import refusing
 WIDTH, PROBES = 1e-3, 12  # relative width aimed at, and number of gammas asked for it
 MISSES = 3  # times that no refusal was found, which takes many passes, before no other is tried
 BEYOND = WIDTH / 8  # how far beyond a gamma the cost is worked out that proves a policy there
-DESCENTS = 2  # times that passes look for a better policy, as often as a refusal does
+DESCENTS = 2  # times that passes, as many as before cells are given up, seek a better policy
 
 
 def bracket(
